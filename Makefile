@@ -1,0 +1,90 @@
+# `make demo` and `make test` are all that a fresh machine needs: each makes the environment first, when it is
+# missing or older than setup.cfg. Needed beforehand: Python 3.11 or newer, git, make, a C compiler.
+
+SHELL := /bin/bash
+VENV  ?= .venv
+BIN   := $(VENV)/bin
+JOBS  ?= 2
+# Tests read real posed images from here; without it they skip, and say so.
+export LSMGEO_TEST_DATA
+
+# The first interpreter that is new enough.
+PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 python; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
+
+# The modules whose lines must be covered: what the operators consist of.
+CORE := lsmgeo/__init__.py,lsmgeo/errors.py,lsmgeo/debugging.py,lsmgeo/grids.py,lsmgeo/functional.py,lsmgeo/layers.py,lsmgeo/fusion.py,lsmgeo/rays.py,lsmgeo/cameras/*,lsmgeo/kernels/*
+CORE_COVERAGE := 95
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-long lint docs bench wheel clean
+
+help: ## this list
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+# uv installs in a tenth of pip's time. It is used where it is on PATH or can be fetched, and pip does the work otherwise.
+# $(1): bin folder of the environment, $(2): what to install
+define install
+	@if UV=$$(command -v uv) || { $(1)/python -m pip install --quiet uv 2>/dev/null && UV=$(1)/uv; }; then \
+		"$$UV" pip install --quiet --python $(1)/python $(2) && exit 0; \
+		echo 'uv could not install; trying pip' >&2; \
+	fi; \
+	$(1)/python -m pip install --quiet $(2)
+endef
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo 'Python 3.11 or newer is needed; name one with make PYTHON=/path/to/python' >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.core: setup.cfg pyproject.toml | $(BIN)/python
+	@echo 'installing lsmgeo into $(VENV) (once; PyTorch is large)'
+	$(call install,$(BIN),-e .)
+	@touch $@
+
+$(VENV)/.dev: setup.cfg pyproject.toml | $(BIN)/python
+	@echo 'installing lsmgeo and what its tests and docs need into $(VENV) (once; PyTorch is large)'
+	$(call install,$(BIN),-e '.[dev]')
+	@touch $(VENV)/.core $@
+
+setup: $(VENV)/.dev ## make the environment, with everything for tests and docs
+
+demo: $(VENV)/.core ## run the main job on an analytic scene; pictures go to demo/
+	$(BIN)/lsmgeo demo --out demo
+
+# One thread a process: two workers of two threads each run slower than two of one.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+
+test: $(VENV)/.dev ## whole suite, doctests, and the core's coverage
+	@rm -f .coverage .coverage.*
+	$(PYTEST) -n $(JOBS) --dist worksteal -m 'not long' --cov --cov-report= --durations=10
+	@echo 'lines of the core:'
+	@$(BIN)/coverage report --include='$(CORE)' --fail-under=$(CORE_COVERAGE)
+
+test-long: $(VENV)/.dev ## the long forms: random examples in number, slow checks
+	HYPOTHESIS_PROFILE=long $(PYTEST) -n $(JOBS) --dist worksteal --timeout 3600 --durations=20
+
+lint: $(VENV)/.dev ## ruff, mypy, static gates
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python tests/static_gates.py
+
+docs: $(VENV)/.dev ## pages and executed gallery, to docs/_build/html
+	OMP_NUM_THREADS=$(JOBS) $(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
+	@echo 'docs: docs/_build/html/index.html'
+
+bench: $(VENV)/.dev ## the reference path against hand-written projection and grid_sample
+	$(BIN)/python -m benchmarks
+
+wheel: $(VENV)/.core ## build the wheel, install it into a clean environment, run the demo from there
+	@rm -rf dist build
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	@rm -rf build/clean && $(BIN)/python -m venv build/clean
+	$(call install,build/clean/bin,dist/*.whl)
+	cd build && clean/bin/lsmgeo demo --out wheel-demo
+	@ls -l dist
+
+clean: ## remove what the commands wrote; the environment stays
+	rm -rf build dist *.egg-info demo docs/_build docs/auto_examples docs/api/generated docs/sg_execution_times.rst
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage .coverage.* htmlcov
+	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +

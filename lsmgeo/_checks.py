@@ -1,0 +1,97 @@
+"""Checks of arguments that every public function shares; each names what was expected and what came."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from numbers import Real
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lsmgeo.errors import DeviceError, DTypeError, OptionError, ShapeError
+
+__all__ = ["check_choice", "check_choices", "check_devices", "check_float", "check_mask", "check_number", "check_size"]
+
+FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+
+
+def describe(value: Any) -> str:
+    """What a value is, in few words, for an error message."""
+    if isinstance(value, Tensor):
+        return f"a tensor {tuple(value.shape)} of {value.dtype}"
+    text = repr(value)
+    return f"{type(value).__name__} {text if len(text) <= 60 else text[:57] + '...'}"
+
+
+def check_float(
+    who: str, name: str, value: Any, expected: str, rank: int | None = None, dtypes: Sequence[torch.dtype] = FLOATS
+) -> None:
+    """Require a floating-point tensor, of the given rank if any."""
+    if not isinstance(value, Tensor):
+        raise DTypeError(f"{who}: {name} must be a tensor {expected}; got {describe(value)}")
+    if value.dtype not in dtypes:
+        allowed = ", ".join(str(dtype).removeprefix("torch.") for dtype in dtypes)
+        raise DTypeError(f"{who}: {name} must be of {allowed}; got {value.dtype}")
+    if value.layout != torch.strided:
+        raise DTypeError(f"{who}: {name} must be a dense tensor; got layout {value.layout}")
+    if rank is not None and value.dim() != rank:
+        raise ShapeError(f"{who}: {name} must be {expected}; got {tuple(value.shape)}")
+
+
+def check_mask(who: str, name: str, value: Any, shape: tuple[int, ...], expected: str) -> None:
+    """Require a boolean tensor of exactly this shape."""
+    if not isinstance(value, Tensor) or value.dtype != torch.bool:
+        raise DTypeError(f"{who}: {name} must be a bool tensor {expected}; got {describe(value)}")
+    if tuple(value.shape) != tuple(shape):
+        raise ShapeError(f"{who}: {name} must be {expected} = {tuple(shape)}; got {tuple(value.shape)}")
+
+
+def check_choice(who: str, name: str, value: Any, choices: Sequence[str]) -> str:
+    """Require one of the named options."""
+    if not isinstance(value, str) or value not in choices:
+        raise OptionError(f"{who}: {name} must be one of {', '.join(map(repr, choices))}; got {describe(value)}")
+    return value
+
+
+def check_choices(who: str, name: str, value: Any, choices: Sequence[str]) -> tuple[str, ...]:
+    """Require a name, or an iterable of different names, out of the options; return a tuple."""
+    if isinstance(value, str):
+        value = (value,)
+    if not isinstance(value, Iterable) or isinstance(value, Tensor):
+        raise OptionError(f"{who}: {name} must be names out of {', '.join(map(repr, choices))}; got {describe(value)}")
+    names = tuple(check_choice(who, name, item, choices) for item in value)
+    if len(set(names)) != len(names):
+        raise OptionError(f"{who}: {name} must not repeat a name; got {names}")
+    return names
+
+
+def check_number(who: str, name: str, value: Any, expected: str) -> float:
+    """Require a finite real number."""
+    if not isinstance(value, Real) or isinstance(value, bool) or not abs(float(value)) < float("inf"):
+        raise OptionError(f"{who}: {name} must be {expected}; got {describe(value)}")
+    return float(value)
+
+
+def check_size(who: str, name: str, value: Any, length: int, expected: str) -> tuple[int, ...]:
+    """Require that many positive integers (an int alone stands for all of them where `length` is 3)."""
+    if isinstance(value, int) and not isinstance(value, bool) and length == 3:
+        value = (value,) * 3
+    if (
+        not isinstance(value, Sequence)
+        or isinstance(value, str)
+        or len(value) != length
+        or not all(isinstance(item, int | torch.SymInt) and not isinstance(item, bool) for item in value)
+    ):
+        raise ShapeError(f"{who}: {name} must be {expected}; got {describe(value)}")
+    if any(item < 1 for item in value):
+        raise ShapeError(f"{who}: {name} must be {expected}, each at least 1; got {tuple(value)}")
+    return tuple(value)
+
+
+def check_devices(who: str, **tensors: Tensor | None) -> None:
+    """Require that all tensors given are on one device."""
+    given = {name: tensor.device for name, tensor in tensors.items() if tensor is not None}
+    if len(set(given.values())) > 1:
+        places = ", ".join(f"{name} on {device}" for name, device in given.items())
+        raise DeviceError(f"{who}: all tensors must be on one device; got {places}")

@@ -1,0 +1,50 @@
+"""Closed forms for matrices of 3 and 4 rows.
+
+Written with elementwise products, never with matrix multiplication: autocast and TF32 act on the latter, and cost
+whole pixels there.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["affine_inverse", "cross", "homogeneous_row", "inverse_3x3", "multiply", "transform"]
+
+
+def multiply(left: Tensor, right: Tensor) -> Tensor:
+    """Matrix product of (..., n, k) and (..., k, m)."""
+    return (left[..., :, :, None] * right[..., None, :, :]).sum(-2)
+
+
+def transform(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Matrix (..., n, k) times vector (..., k)."""
+    return (matrix * vector[..., None, :]).sum(-1)
+
+
+def cross(left: Tensor, right: Tensor) -> Tensor:
+    """Cross product over the last axis, broadcasting."""
+    a, b, c = left.unbind(-1)
+    d, e, f = right.unbind(-1)
+    return torch.stack((b * f - c * e, c * d - a * f, a * e - b * d), -1)
+
+
+def inverse_3x3(matrix: Tensor) -> Tensor:
+    """Inverse of (..., 3, 3) as the adjugate over the determinant: differentiable, and exact where a solver is not."""
+    first, second, third = matrix.unbind(-2)
+    adjugate = torch.stack((cross(second, third), cross(third, first), cross(first, second)), -1)  # (..., 3, 3)
+    determinant = (first * adjugate[..., :, 0]).sum(-1)
+    return adjugate / determinant[..., None, None]
+
+
+def homogeneous_row(rows: Tensor) -> Tensor:
+    """Append the row (0, 0, 0, 1) to (..., 3, 4)."""
+    last = rows.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*rows.shape[:-2], 1, 4)
+    return torch.cat((rows, last), -2)
+
+
+def affine_inverse(matrix: Tensor) -> Tensor:
+    """Inverse of an affine (..., 4, 4), whose last row is taken to be (0, 0, 0, 1)."""
+    linear = inverse_3x3(matrix[..., :3, :3])
+    offset = -transform(linear, matrix[..., :3, 3])
+    return homogeneous_row(torch.cat((linear, offset[..., None]), -1))

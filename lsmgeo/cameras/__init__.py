@@ -1,0 +1,40 @@
+"""Pinhole cameras: one plain form, kornia's classes in and out, and the conventions of other tools.
+
+Only this package knows kornia's camera classes. Conventions: OpenCV axes (x right, y down, z forward), world-to-camera
+extrinsics ``X_cam = R X_world + t``, integer pixel centres.
+"""
+
+from lsmgeo.cameras.converters import (
+    from_colmap,
+    from_opencv,
+    from_opengl,
+    from_pytorch3d,
+    to_colmap,
+    to_opencv,
+    to_opengl,
+    to_pytorch3d,
+)
+from lsmgeo.cameras.tensors import CameraTensors, as_tensors, check_cameras, stack, to
+from lsmgeo.cameras.transforms import crop, look_at, orbit, perturb, rays, resize
+
+__all__ = [
+    "CameraTensors",
+    "as_tensors",
+    "check_cameras",
+    "crop",
+    "from_colmap",
+    "from_opencv",
+    "from_opengl",
+    "from_pytorch3d",
+    "look_at",
+    "orbit",
+    "perturb",
+    "rays",
+    "resize",
+    "stack",
+    "to",
+    "to_colmap",
+    "to_opencv",
+    "to_opengl",
+    "to_pytorch3d",
+]

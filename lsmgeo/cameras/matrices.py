@@ -1,0 +1,81 @@
+"""The small matrices of cameras, composed in float64: what the operators are made of."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lsmgeo._linalg import inverse_3x3, multiply, transform
+from lsmgeo.cameras.tensors import CameraTensors, image_sizes
+
+__all__ = ["CameraMatrices", "camera_matrices", "resize_matrix"]
+
+
+class CameraMatrices(NamedTuple):
+    """Cameras in float64 for images of one size: K (..., 3, 3), R (..., 3, 3), t (..., 3), camera centre C (..., 3)."""
+
+    intrinsics: Tensor
+    rotation: Tensor
+    translation: Tensor
+    center: Tensor
+
+    @property
+    def projection(self) -> Tensor:
+        """P = K [R|t], (..., 3, 4): pixel from world."""
+        return multiply(self.intrinsics, torch.cat((self.rotation, self.translation[..., None]), -1))
+
+    @property
+    def world_from_frustum(self) -> Tensor:
+        """T, (..., 4, 4), with ``X ~ T (u, v, 1/depth, 1)``; column three is the camera centre."""
+        rays = multiply(self.rotation.transpose(-1, -2), inverse_3x3(self.intrinsics))  # R^T K^-1
+        rows = torch.cat((rays[..., :2], self.center[..., None], rays[..., 2:]), -1)
+        last = rows.new_tensor([0.0, 0.0, 1.0, 0.0]).expand(*rows.shape[:-2], 1, 4)
+        return torch.cat((rows, last), -2)
+
+
+def resize_matrix(
+    height: Tensor, width: Tensor, new_height: int | Tensor, new_width: int | Tensor, dtype: torch.dtype = torch.float64
+) -> Tensor:
+    """S, (..., 3, 3), with ``K' = S K``: fx' = fx w/W, cx' = (cx + 0.5) w/W - 0.5, skew' = skew w/W, same in y.
+
+    This is the rule for integer pixel centres and images that tile the same area. kornia's ``PinholeCamera.scale`` has
+    cx' = s cx instead, which contradicts kornia's own pixel grid (kornia issue 4263).
+    """
+    scale_x = new_width / width.to(dtype)
+    scale_y = new_height / height.to(dtype)
+    zero, one = torch.zeros_like(scale_x), torch.ones_like(scale_x)
+    rows = (scale_x, zero, 0.5 * scale_x - 0.5, zero, scale_y, 0.5 * scale_y - 0.5, zero, zero, one)
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def camera_matrices(
+    cameras: CameraTensors, size: tuple[int, int] | None = None, view_mask: Tensor | None = None
+) -> CameraMatrices:
+    """Bring cameras to float64, and their K to images of another size.
+
+    Args:
+        cameras: from `as_tensors`, leading shape (...).
+        size: (height, width) of the images to be sampled; None keeps the cameras' own.
+        view_mask: (...) bool; cameras where it is False are unread: identity in their place, no gradient.
+
+    Returns:
+        `CameraMatrices`. The last rows of K and of the extrinsics are taken to be exact.
+    """
+    intrinsics, cam_from_world = cameras.intrinsics, cameras.cam_from_world
+    height, width = image_sizes(cameras)
+    if view_mask is not None:
+        used = view_mask[..., None, None]
+        identity = torch.eye(4, dtype=intrinsics.dtype, device=intrinsics.device)
+        intrinsics = torch.where(used, intrinsics, identity[:3, :3])
+        cam_from_world = torch.where(used, cam_from_world, identity)
+        height, width = (torch.where(view_mask, side, torch.ones_like(side)) for side in (height, width))
+    K = intrinsics[..., :2, :].double()
+    last = K.new_tensor([0.0, 0.0, 1.0]).expand(*K.shape[:-2], 1, 3)
+    K = torch.cat((K, last), -2)
+    if size is not None:
+        K = multiply(resize_matrix(height, width, *size), K)
+    R = cam_from_world[..., :3, :3].double()
+    t = cam_from_world[..., :3, 3].double()
+    return CameraMatrices(K, R, t, -transform(R.transpose(-1, -2), t))

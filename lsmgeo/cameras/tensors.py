@@ -1,0 +1,238 @@
+"""`CameraTensors`, the plain form of any number of pinhole cameras, and what turns kornia's classes into it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from lsmgeo._checks import check_devices, check_float, describe
+from lsmgeo._linalg import multiply
+from lsmgeo.debugging import can_inspect
+from lsmgeo.errors import CameraError, DTypeError, ShapeError
+
+__all__ = ["CameraTensors", "as_tensors", "check_cameras", "image_sizes", "stack", "to"]
+
+CAMERA_DTYPES = (torch.float32, torch.float64)
+
+
+class CameraTensors(NamedTuple):
+    """Pinhole cameras as four tensors: a pytree, so it goes through export, vmap and data loaders.
+
+    Convention:
+        ``x ~ K (R X + t)`` with OpenCV axes (x right, y down, z forward), world-to-camera extrinsics and integer pixel
+        centres: pixel (0, 0) is centred at (0.0, 0.0) and the image covers [-0.5, width - 0.5) x [-0.5, height - 0.5).
+
+    Attributes:
+        intrinsics: (..., 3, 3) calibration matrices K in pixels, last row (0, 0, 1), skew allowed; of a 4x4 matrix the
+            top-left 3x3 counts. float32 or float64.
+        cam_from_world: (..., 4, 4) rigid world-to-camera transforms ``[[R, t], [0, 0, 0, 1]]``, of the same dtype.
+        height: (...) image heights in pixels, or one int for all.
+        width: (...) image widths in pixels, or one int for all.
+
+    The leading shape is (B, V) where an operator takes V views of B scenes (or (B*V,), view fastest), and (B,) or ()
+    where one camera a scene is meant.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.cameras import CameraTensors
+        >>> cameras = CameraTensors(torch.eye(3).expand(2, 4, 3, 3), torch.eye(4).expand(2, 4, 4, 4), 48, 64)
+        >>> cameras.to_kornia().batch_size
+        8
+    """
+
+    intrinsics: Tensor
+    cam_from_world: Tensor
+    height: Tensor | int
+    width: Tensor | int
+
+    @classmethod
+    def from_kornia(cls, camera: PinholeCamera) -> CameraTensors:
+        """The tensors of a kornia camera: leading shape (N,), or (B, V) where kornia stores (B, V, 4, 4)."""
+        return as_tensors(camera)
+
+    def to_kornia(self) -> PinholeCamera:
+        """The same cameras as one kornia ``PinholeCamera``, leading axes flattened (view fastest)."""
+        cameras = as_tensors(self)
+        corner = cameras.intrinsics.new_tensor([0.0, 0.0, 0.0, 1.0])
+        intrinsics = torch.cat((cameras.intrinsics, torch.zeros_like(cameras.intrinsics[..., :1])), -1)
+        intrinsics = torch.cat((intrinsics, corner.expand(*intrinsics.shape[:-2], 1, 4)), -2)
+        return PinholeCamera(
+            intrinsics.reshape(-1, 4, 4),
+            cameras.cam_from_world.reshape(-1, 4, 4),
+            *(size.reshape(-1) for size in image_sizes(cameras)),
+        )
+
+
+def as_tensors(cameras: PinholeCamera | CameraTensors, who: str = "cameras") -> CameraTensors:
+    """Bring any accepted form of cameras to `CameraTensors` with 3x3 intrinsics and sizes as tensors.
+
+    Args:
+        cameras: `CameraTensors`, a kornia ``PinholeCamera`` with (N, 4, 4) or (B, V, 4, 4) storage, or a kornia
+            ``PinholeCamerasList``.
+        who: the function that asks, named in errors.
+
+    Returns:
+        The cameras, with the leading shape they came with. Values are not checked here.
+
+    Raises:
+        DTypeError: another type, or not float32 or float64.
+        ShapeError: shapes that do not belong together.
+        DeviceError: tensors on different devices.
+    """
+    if isinstance(cameras, PinholeCamera):
+        height, width = cameras.height, cameras.width
+        if cameras.intrinsics.dim() == 4 and height.dim() == 1:  # (B, V, 4, 4): the views share (B,) sizes
+            height, width = (size[:, None].expand(cameras.intrinsics.shape[:2]) for size in (height, width))
+        cameras = CameraTensors(cameras.intrinsics, cameras.extrinsics, height, width)
+    elif not isinstance(cameras, CameraTensors):
+        raise DTypeError(
+            f"{who}: cameras must be a kornia PinholeCamera, a PinholeCamerasList or lsmgeo.cameras.CameraTensors; "
+            f"got {describe(cameras)}"
+        )
+    intrinsics, cam_from_world = cameras.intrinsics, cameras.cam_from_world
+    check_float(who, "cameras.intrinsics", intrinsics, "(..., 3, 3) or (..., 4, 4)", dtypes=CAMERA_DTYPES)
+    check_float(who, "cameras.cam_from_world", cam_from_world, "(..., 4, 4)", dtypes=CAMERA_DTYPES)
+    if intrinsics.dim() < 2 or tuple(intrinsics.shape[-2:]) not in ((3, 3), (4, 4)):
+        raise ShapeError(f"{who}: cameras.intrinsics must be (..., 3, 3) or (..., 4, 4); got {tuple(intrinsics.shape)}")
+    if cam_from_world.dim() < 2 or tuple(cam_from_world.shape[-2:]) != (4, 4):
+        raise ShapeError(
+            f"{who}: cameras.cam_from_world must be (..., 4, 4), the whole world-to-camera matrix; "
+            f"got {tuple(cam_from_world.shape)}"
+        )
+    leading = tuple(cam_from_world.shape[:-2])
+    if tuple(intrinsics.shape[:-2]) != leading:
+        raise ShapeError(
+            f"{who}: cameras.intrinsics and cameras.cam_from_world must agree in their leading shape; "
+            f"got {tuple(intrinsics.shape)} and {tuple(cam_from_world.shape)}"
+        )
+    if intrinsics.dtype != cam_from_world.dtype:
+        raise DTypeError(
+            f"{who}: cameras.intrinsics and cameras.cam_from_world must be of one dtype; "
+            f"got {intrinsics.dtype} and {cam_from_world.dtype}"
+        )
+    height = _size(who, "height", cameras.height, leading, intrinsics)
+    width = _size(who, "width", cameras.width, leading, intrinsics)
+    check_devices(who, intrinsics=intrinsics, cam_from_world=cam_from_world, height=height, width=width)
+    return CameraTensors(intrinsics[..., :3, :3], cam_from_world, height, width)
+
+
+def image_sizes(cameras: CameraTensors) -> tuple[Tensor, Tensor]:
+    """Heights and widths as tensors, which they are after `as_tensors`."""
+    return torch.as_tensor(cameras.height), torch.as_tensor(cameras.width)
+
+
+def _size(who: str, name: str, value: Any, leading: tuple[int, ...], like: Tensor) -> Tensor:
+    if isinstance(value, int) and not isinstance(value, bool):
+        if value < 1:
+            raise CameraError(f"{who}: cameras.{name} must be at least 1 pixel; got {value}")
+        return torch.full(leading, value, dtype=torch.int64, device=like.device)
+    if not isinstance(value, Tensor) or value.dtype == torch.bool or value.is_complex():
+        raise DTypeError(f"{who}: cameras.{name} must be an int or a real tensor; got {describe(value)}")
+    if tuple(value.shape) != leading:
+        raise ShapeError(
+            f"{who}: cameras.{name} must have the cameras' leading shape {leading}; got {tuple(value.shape)}"
+        )
+    return value
+
+
+def check_cameras(who: str, cameras: CameraTensors, view_mask: Tensor | None = None) -> None:
+    """Raise a `CameraError` that names the first bad camera, if the values may be read (see `lsmgeo.debug`).
+
+    Checked: finite values; K with positive focal lengths, no vertical skew and last row (0, 0, 1); rigid, unmirrored
+    extrinsics (``max |R^T R - I| <= 1e-3``, det R > 0) with last row (0, 0, 0, 1); sizes of at least one pixel.
+
+    Args:
+        who: the function that asks.
+        cameras: from `as_tensors`.
+        view_mask: bool, of the cameras' leading shape; cameras where it is False are not looked at.
+    """
+    intrinsics, cam_from_world = cameras.intrinsics, cameras.cam_from_world
+    height, width = image_sizes(cameras)
+    if not can_inspect(intrinsics) or intrinsics.numel() == 0:
+        return
+    with torch.no_grad():
+        K, E = intrinsics.double(), cam_from_world.double()
+        R = E[..., :3, :3]
+        residual = (
+            (multiply(R.transpose(-1, -2), R) - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-1, -2))
+        )
+        triple = (R[..., 0, :] * torch.linalg.cross(R[..., 1, :], R[..., 2, :])).sum(-1)
+        focal = torch.minimum(K[..., 0, 0], K[..., 1, 1])
+        smallest = 1e-6 * torch.maximum(height, width)
+        last_k = (K[..., 2, :] - K.new_tensor([0.0, 0.0, 1.0])).abs().amax(-1)
+        last_e = (E[..., 3, :] - E.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax(-1)
+        rules = (
+            # Written so that a NaN breaks the rule that names it first.
+            ("intrinsics must be finite", K.isfinite().all(-1).all(-1), None),
+            ("cam_from_world must be finite", E.isfinite().all(-1).all(-1), None),
+            ("height and width must be at least 1 pixel", (height >= 1) & (width >= 1), None),
+            ("intrinsics must have the last row (0, 0, 1); its largest deviation is", last_k <= 1e-3, last_k),
+            ("focal lengths must be positive pixels, 1e-6 of the image size at least; got", focal > smallest, focal),
+            ("intrinsics[1, 0] must be 0; got", K[..., 1, 0].abs() <= 1e-6 * focal, K[..., 1, 0]),
+            ("cam_from_world must have the last row (0, 0, 0, 1); its largest deviation is", last_e <= 1e-3, last_e),
+            ("the rotation must be orthonormal (a scale in it?); max |R^T R - I| is", residual <= 1e-3, residual),
+            ("the rotation must not mirror (is an axis flipped?); its determinant is", triple > 0, triple),
+        )
+        good = torch.stack([rule for _, rule, _ in rules])
+        if view_mask is not None:
+            good = good | ~view_mask
+        if bool(good.all()):
+            return
+        for (text, _, value), passed in zip(rules, good, strict=True):
+            if not bool(passed.all()):
+                index = tuple((~passed).nonzero()[0].tolist())
+                came = "" if value is None else f" {value[index].item():.6g}"
+                raise CameraError(f"{who}: cameras{list(index) if index else ''}: {text}{came}")
+
+
+def stack(cameras: Sequence[PinholeCamera | CameraTensors], dim: int = 0) -> CameraTensors:
+    """Stack cameras of equal leading shape along a new leading axis, as ``torch.stack`` does.
+
+    Args:
+        cameras: at least one; V cameras with leading shape (B,) stacked with ``dim=1`` give (B, V).
+        dim: where the new axis goes, 0 to the number of leading axes.
+
+    Returns:
+        `CameraTensors` with the new leading axis.
+
+    Raises:
+        ShapeError: no camera, or unequal leading shapes.
+
+    Example:
+        >>> from lsmgeo.cameras import orbit, stack
+        >>> views = [orbit(a, 10.0, 2.0, focal_length=50.0, height=48, width=64) for a in (0.0, 45.0, 90.0)]
+        >>> tuple(stack(views).intrinsics.shape)
+        (3, 3, 3)
+    """
+    parts = [as_tensors(camera, "stack") for camera in cameras]
+    if not parts:
+        raise ShapeError("stack: cameras must hold at least one camera; got none")
+    leading = [tuple(part.cam_from_world.shape[:-2]) for part in parts]
+    if len(set(leading)) > 1:
+        raise ShapeError(f"stack: cameras must have one leading shape; got {leading}")
+    if not isinstance(dim, int) or not 0 <= dim <= len(leading[0]):
+        raise ShapeError(f"stack: dim must be 0 to {len(leading[0])}; got {describe(dim)}")
+    check_devices("stack", **{f"cameras[{i}]": part.intrinsics for i, part in enumerate(parts)})
+    fields = (torch.stack([torch.as_tensor(field) for field in column], dim) for column in zip(*parts, strict=True))
+    return CameraTensors(*fields)
+
+
+def to(cameras: PinholeCamera | CameraTensors, *args: Any, **kwargs: Any) -> CameraTensors:
+    """Move cameras to a device or dtype; the arguments are those of ``torch.Tensor.to``.
+
+    Sizes follow the device and keep their dtype.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.cameras import orbit, to
+        >>> to(orbit(0.0, 10.0, 2.0, focal_length=50.0, height=48, width=64), torch.float64).intrinsics.dtype
+        torch.float64
+    """
+    tensors = as_tensors(cameras, "to")
+    moved = tensors.intrinsics.to(*args, **kwargs)
+    height, width = (size.to(moved.device) for size in image_sizes(tensors))
+    return as_tensors(CameraTensors(moved, tensors.cam_from_world.to(*args, **kwargs), height, width), "to")

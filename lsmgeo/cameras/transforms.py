@@ -1,0 +1,327 @@
+"""Cameras made, moved, resized and cropped; the rays of their pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+from torch import Tensor
+
+from lsmgeo._checks import check_float, check_number, check_size
+from lsmgeo._linalg import cross, homogeneous_row, inverse_3x3, multiply, transform
+from lsmgeo.cameras.matrices import resize_matrix
+from lsmgeo.cameras.tensors import CAMERA_DTYPES, CameraTensors, as_tensors, check_cameras, image_sizes
+from lsmgeo.debugging import can_inspect
+from lsmgeo.errors import CameraError, OptionError, ShapeError
+
+__all__ = ["crop", "look_at", "orbit", "perturb", "rays", "resize"]
+
+Vector = Tensor | Sequence[float]
+
+
+def resize(cameras: PinholeCamera | CameraTensors, height: int, width: int) -> CameraTensors:
+    """The cameras of the same images resized to (height, width).
+
+    Equation: with sx = width'/width, fx' = fx sx, skew' = skew sx, cx' = (cx + 0.5) sx - 0.5; the same in y.
+
+    Convention:
+        Integer pixel centres; both images tile the same area. kornia's ``PinholeCamera.scale`` differs (kornia issue
+        4263).
+
+    Args:
+        cameras: any number of cameras.
+        height: new height in pixels.
+        width: new width in pixels.
+
+    Returns:
+        `CameraTensors` of the new size; differentiable.
+
+    Raises:
+        ShapeError: a size below 1.
+
+    Example:
+        >>> from lsmgeo.cameras import orbit, resize
+        >>> camera = orbit(0.0, 10.0, 2.0, focal_length=100.0, height=48, width=64)
+        >>> resize(camera, 24, 32).intrinsics
+        tensor([[50.0000,  0.0000, 15.5000],
+                [ 0.0000, 50.0000, 11.5000],
+                [ 0.0000,  0.0000,  1.0000]])
+    """
+    height, width = check_size("resize", "(height, width)", (height, width), 2, "two integers")
+    tensors = as_tensors(cameras, "resize")
+    old_height, old_width = image_sizes(tensors)
+    scale = resize_matrix(old_height, old_width, height, width, tensors.intrinsics.dtype)
+    return CameraTensors(
+        multiply(scale, tensors.intrinsics),
+        tensors.cam_from_world,
+        torch.full_like(old_height, height),
+        torch.full_like(old_width, width),
+    )
+
+
+def crop(
+    cameras: PinholeCamera | CameraTensors, top: int | Tensor, left: int | Tensor, height: int, width: int
+) -> CameraTensors:
+    """The cameras of windows cut out of the same images (or of padded images, where top or left is negative).
+
+    Equation: cx' = cx - left, cy' = cy - top.
+
+    Args:
+        cameras: leading shape (...).
+        top: first row of the window, a number or (...).
+        left: first column of the window, a number or (...).
+        height: rows of the window.
+        width: columns of the window.
+
+    Returns:
+        `CameraTensors` of the windows.
+
+    Raises:
+        ShapeError: a size below 1.
+
+    Example:
+        >>> from lsmgeo.cameras import crop, orbit
+        >>> camera = orbit(0.0, 10.0, 2.0, focal_length=100.0, height=48, width=64)
+        >>> crop(camera, 8, 16, 32, 32).intrinsics[:2, 2]
+        tensor([15.5000, 15.5000])
+    """
+    height, width = check_size("crop", "(height, width)", (height, width), 2, "two integers")
+    tensors = as_tensors(cameras, "crop")
+    old_height, old_width = image_sizes(tensors)
+    K = tensors.intrinsics
+    leading = K.shape[:-2]
+    offset = torch.stack(
+        [torch.as_tensor(side, dtype=K.dtype, device=K.device).expand(leading) for side in (left, top, 0)], -1
+    )
+    shift = torch.nn.functional.pad(offset[..., None], (2, 0))  # third column
+    return CameraTensors(
+        K - shift,
+        tensors.cam_from_world,
+        torch.full_like(old_height, height),
+        torch.full_like(old_width, width),
+    )
+
+
+def _vector(who: str, name: str, value: Vector, like: Tensor | None = None) -> Tensor:
+    if not isinstance(value, Tensor):
+        dtype, device = (like.dtype, like.device) if like is not None else (None, None)
+        try:
+            value = torch.as_tensor(value, dtype=dtype or torch.get_default_dtype(), device=device)
+        except (TypeError, ValueError) as error:
+            raise OptionError(f"{who}: {name} must be x, y, z; got {value!r}") from error
+    check_float(who, name, value, "(..., 3)", dtypes=CAMERA_DTYPES)
+    if value.dim() < 1 or value.shape[-1] != 3:
+        raise ShapeError(f"{who}: {name} must be (..., 3); got {tuple(value.shape)}")
+    return value
+
+
+def look_at(eye: Vector, target: Vector = (0.0, 0.0, 0.0), up: Vector = (0.0, 1.0, 0.0)) -> Tensor:
+    """World-to-camera matrices of cameras at `eye` that look at `target`, the world's `up` upwards in the image.
+
+    Equation: z = normalize(target - eye), x = normalize(z x up), y = z x x are the rows of R; t = -R eye.
+
+    Args:
+        eye: (..., 3) camera centres, world units.
+        target: (..., 3) points on the optical axes.
+        up: (..., 3) directions, not along the optical axis.
+
+    Returns:
+        ``cam_from_world``, (..., 4, 4); differentiable in all arguments.
+
+    Raises:
+        CameraError: eye equals target, or up is along the optical axis.
+
+    Example:
+        >>> from lsmgeo.cameras import look_at
+        >>> look_at((0.0, 0.0, -2.0))
+        tensor([[-1.,  0.,  0.,  0.],
+                [ 0., -1.,  0.,  0.],
+                [ 0.,  0.,  1.,  2.],
+                [ 0.,  0.,  0.,  1.]])
+    """
+    eye = _vector("look_at", "eye", eye)
+    target, up = _vector("look_at", "target", target, eye), _vector("look_at", "up", up, eye)
+    forward = target - eye
+    right = cross(forward, up)
+    if can_inspect(right):
+        scale = torch.linalg.vector_norm(forward, dim=-1) * torch.linalg.vector_norm(up, dim=-1)
+        if not bool((torch.linalg.vector_norm(right, dim=-1) > 1e-6 * scale).all()):
+            raise CameraError("look_at: eye, target and up must span a plane (up is along the viewing direction)")
+    z = forward / torch.linalg.vector_norm(forward, dim=-1, keepdim=True)
+    x = right / torch.linalg.vector_norm(right, dim=-1, keepdim=True)
+    R = torch.stack(torch.broadcast_tensors(x, cross(z, x), z), -2) + 0.0  # + 0.0: no negative zeros
+    return homogeneous_row(torch.cat((R, (0.0 - transform(R, eye))[..., None]), -1))
+
+
+def orbit(
+    azimuth: float | Tensor,
+    elevation: float | Tensor,
+    distance: float | Tensor,
+    *,
+    focal_length: float | Tensor,
+    height: int,
+    width: int,
+    target: Vector = (0.0, 0.0, 0.0),
+) -> CameraTensors:
+    """Cameras on a sphere about a target, y up, all looking at the target.
+
+    Equation: C = target + distance (cos e cos a, sin e, cos e sin a), the azimuth and elevation of ShapeNet renderings.
+
+    Args:
+        azimuth: degrees, a number or (...).
+        elevation: degrees in (-90, 90), a number or (...).
+        distance: world units, a number or (...).
+        focal_length: pixels, a number or (...); fx = fy.
+        height: pixels.
+        width: pixels; the principal point is the image centre ((width - 1) / 2, (height - 1) / 2).
+        target: (3,) or (..., 3).
+
+    Returns:
+        `CameraTensors` with the arguments' common shape (...) as leading shape.
+
+    Raises:
+        CameraError: an elevation of 90 degrees, a distance of 0.
+        ShapeError: a size below 1.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.cameras import orbit
+        >>> cameras = orbit(torch.tensor([0.0, 90.0]), 0.0, 2.0, focal_length=100.0, height=48, width=64)
+        >>> cameras.cam_from_world[0]
+        tensor([[ 0.,  0., -1.,  0.],
+                [ 0., -1.,  0.,  0.],
+                [-1.,  0.,  0.,  2.],
+                [ 0.,  0.,  0.,  1.]])
+    """
+    height, width = check_size("orbit", "(height, width)", (height, width), 2, "two integers")
+    given = [value for value in (azimuth, elevation, distance, focal_length) if isinstance(value, Tensor)]
+    like = given[0] if given else torch.zeros(())
+    numbers = []
+    for name, value in zip(
+        ("azimuth", "elevation", "distance", "focal_length"), (azimuth, elevation, distance, focal_length), strict=True
+    ):
+        if isinstance(value, Tensor):
+            check_float("orbit", name, value, "a number or a tensor", dtypes=CAMERA_DTYPES)
+        else:
+            value = like.new_tensor(check_number("orbit", name, value, "a finite number"))
+        numbers.append(value)
+    turn, tilt, radius, focal = torch.broadcast_tensors(*numbers)
+    a, e = torch.deg2rad(turn), torch.deg2rad(tilt)
+    target = _vector("orbit", "target", target, turn)
+    direction = torch.stack((e.cos() * a.cos(), e.sin(), e.cos() * a.sin()), -1)
+    zero, one = torch.zeros_like(focal), torch.ones_like(focal)
+    rows = (focal, zero, one * (0.5 * width - 0.5), zero, focal, one * (0.5 * height - 0.5), zero, zero, one)
+    eye = target + radius[..., None] * direction
+    cam_from_world = look_at(eye, target.expand_as(eye))
+    intrinsics = torch.stack(rows, -1).unflatten(-1, (3, 3)).expand(*eye.shape[:-1], 3, 3)
+    cameras = as_tensors(CameraTensors(intrinsics, cam_from_world, height, width), "orbit")
+    check_cameras("orbit", cameras)
+    return cameras
+
+
+def perturb(
+    cameras: PinholeCamera | CameraTensors,
+    degrees: float,
+    *,
+    target: Vector = (0.0, 0.0, 0.0),
+    generator: torch.Generator | None = None,
+) -> CameraTensors:
+    """Turn every camera about a target by a random rotation: pose noise under which it keeps looking at the object.
+
+    Equation: X_cam = R dR (X - target) + R target + t with dR a rotation about a uniformly random axis by an angle
+    uniform in [-degrees, degrees]; the target keeps its place in the image.
+
+    Args:
+        cameras: leading shape (...).
+        degrees: largest angle.
+        target: (3,) or (..., 3), world units: what the cameras look at.
+        generator: source of randomness on the cameras' device.
+
+    Returns:
+        `CameraTensors`, each with a rotation of its own.
+
+    Raises:
+        OptionError: a negative or infinite angle.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.cameras import orbit, perturb
+        >>> cameras = orbit(torch.tensor([0.0, 90.0]), 20.0, 2.0, focal_length=100.0, height=48, width=64)
+        >>> noisy = perturb(cameras, 5.0, generator=torch.Generator().manual_seed(0))
+        >>> torch.allclose(noisy.cam_from_world[:, :3, 3], cameras.cam_from_world[:, :3, 3])
+        True
+    """
+    degrees = check_number("perturb", "degrees", degrees, "a finite number of degrees, at least 0")
+    if degrees < 0:
+        raise OptionError(f"perturb: degrees must be at least 0; got {degrees}")
+    tensors = as_tensors(cameras, "perturb")
+    E = tensors.cam_from_world
+    target = _vector("perturb", "target", target, E)
+    leading = E.shape[:-2]
+    axis = torch.randn(*leading, 3, generator=generator, dtype=E.dtype, device=E.device)
+    axis = axis / torch.linalg.vector_norm(axis, dim=-1, keepdim=True).clamp_min(torch.finfo(E.dtype).tiny)
+    angle = torch.rand(*leading, 1, generator=generator, dtype=E.dtype, device=E.device) * 2.0 - 1.0
+    turn = axis_angle_to_rotation_matrix((axis * angle * torch.pi * degrees / 180.0).reshape(-1, 3))
+    turn = turn.reshape(*leading, 3, 3)
+    R, t = E[..., :3, :3], E[..., :3, 3]
+    offset = target.expand(*leading, 3) - transform(turn, target.expand(*leading, 3))
+    rows = torch.cat((multiply(R, turn), (transform(R, offset) + t)[..., None]), -1)
+    return tensors._replace(cam_from_world=homogeneous_row(rows))
+
+
+def rays(cameras: PinholeCamera | CameraTensors, size: tuple[int, int] | None = None) -> tuple[Tensor, Tensor]:
+    """The ray of every pixel, in the world.
+
+    Equation: C = -R^T t, d = normalize(R^T K^-1 (u, v, 1)) at integer (u, v).
+
+    Args:
+        cameras: leading shape (...).
+        size: (h, w) of the images, for which K is resized; by default the cameras' own, which must then be one size.
+
+    Returns:
+        Camera centres (..., 3) in world units, and unit directions (..., h, w, 3). Differentiable in K, R and t.
+
+    Raises:
+        CameraError: bad values, or no size given and views of different sizes.
+
+    Example:
+        >>> from lsmgeo.cameras import orbit, rays
+        >>> origins, directions = rays(orbit(0.0, 0.0, 2.0, focal_length=10.0, height=3, width=3))
+        >>> origins
+        tensor([2., 0., 0.])
+        >>> directions[1, 1]
+        tensor([-1.,  0.,  0.])
+    """
+    tensors = as_tensors(cameras, "rays")
+    check_cameras("rays", tensors)
+    if size is None:
+        size = common_size("rays", tensors)
+    else:
+        tensors = resize(tensors, *size)
+    K, E = tensors.intrinsics, tensors.cam_from_world
+    R_inverse = E[..., :3, :3].transpose(-1, -2)
+    v, u = torch.meshgrid(
+        torch.arange(size[0], dtype=K.dtype, device=K.device),
+        torch.arange(size[1], dtype=K.dtype, device=K.device),
+        indexing="ij",
+    )
+    pixels = torch.stack((u, v, torch.ones_like(u)), -1)  # (h, w, 3)
+    directions = transform(multiply(R_inverse, inverse_3x3(K))[..., None, None, :, :], pixels)
+    directions = directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True)
+    return 0.0 - transform(R_inverse, E[..., :3, 3]), directions
+
+
+def common_size(who: str, cameras: CameraTensors) -> tuple[int, int]:
+    """The one image size (height, width) of all cameras; an error where they differ or where values cannot be read."""
+    if torch.compiler.is_compiling():
+        raise CameraError(f"{who}: size must be given under torch.compile and torch.export; got None")
+    heights, widths = (size.unique().tolist() for size in image_sizes(cameras))
+    if len(heights) != 1 or len(widths) != 1:
+        raise CameraError(
+            f"{who}: size must be given where views differ in size; got heights {heights}, widths {widths}"
+        )
+    if heights[0] != int(heights[0]) or widths[0] != int(widths[0]):
+        raise CameraError(f"{who}: size must be given where the cameras' is fractional; got {heights[0]} x {widths[0]}")
+    return int(heights[0]), int(widths[0])

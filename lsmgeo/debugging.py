@@ -1,0 +1,47 @@
+"""Whether values, not only shapes and types, are checked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+import torch
+
+__all__ = ["can_inspect", "debug"]
+
+_debug: ContextVar[bool] = ContextVar("lsmgeo_debug", default=False)
+
+
+@contextmanager
+def debug() -> Iterator[None]:
+    """Check the values of every argument while the context is open, also where that makes a GPU wait.
+
+    Values (finite, rigid, ordered) of tensors on the CPU are always checked in eager mode; inside this context those
+    on other devices are too. Nothing is checked under ``torch.compile``, ``torch.export`` and ``torch.func``, where
+    values cannot be read.
+
+    Example:
+        >>> import torch, lsmgeo
+        >>> with lsmgeo.debug():
+        ...     planes = lsmgeo.depth_planes(1.0, 2.0, 3)
+        >>> planes
+        tensor([1.0000, 1.5000, 2.0000])
+    """
+    token = _debug.set(True)
+    try:
+        yield
+    finally:
+        _debug.reset(token)
+
+
+def is_traced() -> bool:
+    """Whether the running code is being traced or transformed, so that no value may steer it."""
+    return torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
+
+
+def can_inspect(*tensors: torch.Tensor) -> bool:
+    """Whether the values of these tensors may be read without a GPU waiting or a trace breaking."""
+    if is_traced():
+        return False
+    return _debug.get() or all(tensor.device.type == "cpu" for tensor in tensors)

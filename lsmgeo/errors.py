@@ -1,0 +1,63 @@
+"""The errors that the library raises: one base class, each also a Python built-in."""
+
+from __future__ import annotations
+
+from os import PathLike
+
+__all__ = [
+    "BackendError",
+    "CameraError",
+    "DTypeError",
+    "DataError",
+    "DeviceError",
+    "GridError",
+    "LsmGeoError",
+    "OptionError",
+    "ShapeError",
+]
+
+
+class LsmGeoError(Exception):
+    """Base class of every error that the library raises on purpose."""
+
+
+class ShapeError(LsmGeoError, ValueError):
+    """A tensor has the wrong rank or size."""
+
+
+class DTypeError(LsmGeoError, TypeError):
+    """An argument is not of the expected type, or a tensor not of the expected dtype."""
+
+
+class DeviceError(LsmGeoError, ValueError):
+    """Tensors of one call are on different devices."""
+
+
+class CameraError(LsmGeoError, ValueError):
+    """A camera is not a rigid pinhole camera: a singular calibration matrix, a mirrored rotation, and the like."""
+
+
+class GridError(LsmGeoError, ValueError):
+    """A grid is impossible: no voxels, crossed bounds, depths out of order."""
+
+
+class OptionError(LsmGeoError, ValueError):
+    """An option has a value that the operator does not know."""
+
+
+class BackendError(LsmGeoError, RuntimeError):
+    """A backend was asked for by name and cannot run this call."""
+
+
+class DataError(LsmGeoError, OSError):
+    """A file from outside cannot be used.
+
+    Args:
+        path: the file or folder.
+        reason: what is wrong with it.
+    """
+
+    def __init__(self, path: str | PathLike[str], reason: str) -> None:
+        super().__init__(f"{path}: {reason}")
+        self.path = path
+        self.reason = reason

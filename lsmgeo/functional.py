@@ -1,0 +1,598 @@
+"""The operators as functions. All checks live here; the layers are one line over these.
+
+Conventions of every function: pixel centres at integers, OpenCV camera axes, world-to-camera extrinsics, depth is
+camera z; features (B, V, C, h, w), grids (B, C, D, H, W), cameras with batch B*V, view fastest. A feature map of another size
+than the camera's image is resized for inside: never rescale K by hand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from lsmgeo import kernels
+from lsmgeo._checks import check_choices, check_devices, check_float, check_mask, check_size, describe
+from lsmgeo._linalg import affine_inverse, multiply
+from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
+from lsmgeo.cameras.tensors import CameraTensors, as_tensors, check_cameras, image_sizes
+from lsmgeo.cameras.transforms import common_size
+from lsmgeo.debugging import can_inspect
+from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
+from lsmgeo.grids import FrustumGrid, Lattice, VoxelGrid, check_depths
+from lsmgeo.kernels.request import STATISTICS, Options, Sites
+from lsmgeo.kernels.statistics import view_statistics as _view_statistics
+
+__all__ = [
+    "Projected",
+    "Unprojected",
+    "plane_sweep_project",
+    "sample_views",
+    "unproject",
+    "unproject_points",
+    "unproject_slabs",
+    "view_statistics",
+]
+
+Cameras = PinholeCamera | CameraTensors
+Grid = VoxelGrid | FrustumGrid
+Names = str | Sequence[str]
+
+
+class Unprojected(NamedTuple):
+    """Features at sites, and which view sees which site."""
+
+    volume: Tensor
+    visible: Tensor
+
+
+class Projected(NamedTuple):
+    """Swept volumes, and which sample lies in the volume."""
+
+    maps: Tensor
+    visible: Tensor
+
+
+def unproject(
+    features: Tensor,
+    cameras: Cameras,
+    grid: Grid,
+    *,
+    view_mask: Tensor | None = None,
+    mode: str = "bilinear",
+    padding_mode: str = "zeros",
+    augment: Names = (),
+    direction_frame: str = "world",
+    reduce: Names | None = None,
+    near: float = 1e-6,
+    backend: str = "auto",
+) -> Unprojected:
+    """Lift image features to the sites of a grid: each site takes the feature where its ray meets the image.
+
+    Equation: ``f(X) = F(x / z, y / z)`` with ``(x, y, z) = K (R X + t)``, K resized to the feature map, F interpolated
+    (Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017, section 3).
+
+    Convention:
+        Integer pixel centres. A site is visible where its depth is more than `near` and its pixel lies in
+        [-0.5, w - 0.5) x [-0.5, h - 0.5) of the feature map. Features are exactly 0 at sites not in front.
+
+    Args:
+        features: (B, V, C, h, w), float16, bfloat16, float32 or float64.
+        cameras: B*V cameras, view fastest: a kornia ``PinholeCamera`` or ``PinholeCamerasList``, or `CameraTensors`.
+        grid: `VoxelGrid`, or the `FrustumGrid` of a reference camera; its (D, H, W) sites.
+        view_mask: (B, V) bool; views where it is False give zeros, and neither features nor camera are read.
+        mode: "bilinear", or "nearest": the pixel that contains the sample.
+        padding_mode: "zeros" (fades within the outer half pixel; with `reduce`, prefer "border") or "border".
+        augment: "depth" and "direction": append the camera depth, then the unit ray direction (x, y, z), also at
+            invisible sites of views that are not masked.
+        direction_frame: "world" or "camera".
+        reduce: None, or "mean", "variance", "max" or several: statistics over the views that see a site, 0 where none
+            does, without holding the volumes of all views.
+        near: least depth of a visible site, world units.
+        backend: "auto", or the name of one (see `lsmgeo.kernels.explain`).
+
+    Returns:
+        ``volume`` (B, V, C', D, H, W), or (B, C'', D, H, W) with `reduce`; C' is C plus 1 for depth plus 3 for
+        direction, C'' is C' for each statistic in the order asked; and ``visible`` (B, V, D, H, W) bool. Differentiable
+        in features, K, R, t, the grid's pose, its camera and its depths.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, CameraError, GridError, OptionError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import VoxelGrid, functional
+        >>> from lsmgeo.cameras import orbit
+        >>> cameras = orbit(torch.tensor([[0.0, 90.0]]), 0.0, 2.0, focal_length=8.0, height=4, width=4)
+        >>> features = torch.arange(4.0).expand(1, 2, 1, 4, 4)  # each pixel holds its column
+        >>> volume, visible = functional.unproject(features, cameras, VoxelGrid(2))
+        >>> volume[0, 0, 0, 0, 0]
+        tensor([2.3889, 2.6429])
+    """
+    who = "Unproject"
+    options = Options.checked(
+        who,
+        volume=False,
+        mode=mode,
+        padding_mode=padding_mode,
+        augment=augment,
+        direction_frame=direction_frame,
+        reduce=reduce,
+        near=near,
+    )
+    kernels.check_backend(who, backend)
+    lattice = _lattice(who, grid, features)
+    sites = _image_sites(who, features, cameras, lattice, view_mask, options)
+    return Unprojected(*kernels.run("unproject", features, sites, options=options, backend=backend))
+
+
+def unproject_slabs(
+    features: Tensor,
+    cameras: Cameras,
+    grid: Grid,
+    planes: int,
+    *,
+    view_mask: Tensor | None = None,
+    mode: str = "bilinear",
+    padding_mode: str = "zeros",
+    augment: Names = (),
+    direction_frame: str = "world",
+    reduce: Names | None = None,
+    near: float = 1e-6,
+    backend: str = "auto",
+) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """`unproject` for grids too large for memory: one slab of planes along the grid's first axis after another.
+
+    Args:
+        features: (B, V, C, h, w).
+        cameras: B*V cameras.
+        grid: the whole grid, (D, H, W).
+        planes: planes of a slab; the last may have fewer.
+        view_mask: as in `unproject`, like all further options.
+        mode: see `unproject`.
+        padding_mode: see `unproject`.
+        augment: see `unproject`.
+        direction_frame: see `unproject`.
+        reduce: see `unproject`.
+        near: see `unproject`.
+        backend: see `unproject`.
+
+    Yields:
+        ``(start, volume, visible)``: what `unproject` gives at planes start to start + planes, to the last bit.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, CameraError, GridError, OptionError: at the call, before the first slab.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import VoxelGrid, functional
+        >>> from lsmgeo.cameras import orbit
+        >>> cameras = orbit(torch.tensor([[0.0, 90.0]]), 0.0, 2.0, focal_length=8.0, height=4, width=4)
+        >>> features = torch.ones(1, 2, 1, 4, 4)
+        >>> [tuple(volume.shape) for _, volume, _ in functional.unproject_slabs(features, cameras, VoxelGrid(5), 2)]
+        [(1, 2, 1, 2, 5, 5), (1, 2, 1, 2, 5, 5), (1, 2, 1, 1, 5, 5)]
+    """
+    who = "unproject_slabs"
+    if not isinstance(planes, int) or isinstance(planes, bool) or planes < 1:
+        raise OptionError(f"{who}: planes must be an integer, at least 1; got {describe(planes)}")
+    options = Options.checked(
+        who,
+        volume=False,
+        mode=mode,
+        padding_mode=padding_mode,
+        augment=augment,
+        direction_frame=direction_frame,
+        reduce=reduce,
+        near=near,
+    )
+    kernels.check_backend(who, backend)
+    lattice = _lattice(who, grid, features)
+    sites = _image_sites(who, features, cameras, lattice, view_mask, options)
+
+    def slabs() -> Iterator[tuple[int, Tensor, Tensor]]:
+        for start in range(0, sites.z.shape[-1], planes):
+            part = sites.slab(start, start + planes)
+            yield start, *kernels.run("unproject", features, part, options=options, backend=backend)
+
+    return slabs()
+
+
+def unproject_points(
+    features: Tensor,
+    cameras: Cameras,
+    points: Tensor,
+    *,
+    view_mask: Tensor | None = None,
+    mode: str = "bilinear",
+    padding_mode: str = "zeros",
+    augment: Names = (),
+    direction_frame: str = "world",
+    reduce: Names | None = None,
+    near: float = 1e-6,
+    backend: str = "auto",
+) -> Unprojected:
+    """`unproject` at arbitrary points of the world: sparse voxels, surface samples, a point cloud.
+
+    Args:
+        features: (B, V, C, h, w).
+        cameras: B*V cameras.
+        points: (B, N, 3) as x, y, z in world units, float32 or float64.
+        view_mask: as in `unproject`, like all further options.
+        mode: see `unproject`.
+        padding_mode: see `unproject`.
+        augment: see `unproject`.
+        direction_frame: see `unproject`.
+        reduce: see `unproject`.
+        near: see `unproject`.
+        backend: see `unproject`.
+
+    Returns:
+        ``volume`` (B, V, C', N), or (B, C'', N) with `reduce`, and ``visible`` (B, V, N) bool. Differentiable in
+        features, points, K, R and t.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, CameraError, OptionError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import functional
+        >>> from lsmgeo.cameras import orbit
+        >>> cameras = orbit(torch.tensor([[0.0]]), 0.0, 2.0, focal_length=8.0, height=5, width=5)
+        >>> features = torch.arange(5.0).expand(1, 1, 1, 5, 5)
+        >>> functional.unproject_points(features, cameras, torch.zeros(1, 1, 3)).volume
+        tensor([[[[2.]]]])
+    """
+    who = "unproject_points"
+    options = Options.checked(
+        who,
+        volume=False,
+        mode=mode,
+        padding_mode=padding_mode,
+        augment=augment,
+        direction_frame=direction_frame,
+        reduce=reduce,
+        near=near,
+    )
+    kernels.check_backend(who, backend)
+    matrices = _image_matrices(who, features, cameras, view_mask)
+    check_float(who, "points", points, "(B, N, 3)", rank=3, dtypes=(torch.float32, torch.float64))
+    if points.shape[0] != features.shape[0] or points.shape[2] != 3:
+        raise ShapeError(f"{who}: points must be (B, N, 3) with B = {features.shape[0]}; got {tuple(points.shape)}")
+    check_devices(who, features=features, points=points)
+    if can_inspect(points) and not bool(points.isfinite().all()):
+        raise GridError(f"{who}: points must be finite")
+    direction = None
+    if options.direction:
+        world = torch.eye(4, dtype=torch.float64, device=features.device)
+        direction = _direction_matrix(matrices, world, options.direction)
+    arguments = (matrices.projection, direction, points, view_mask)
+    return Unprojected(*kernels.run("unproject_points", features, *arguments, options=options, backend=backend))
+
+
+def sample_views(
+    features: Tensor,
+    pixels: Tensor,
+    depth: Tensor,
+    valid: Tensor,
+    *,
+    mode: str = "bilinear",
+    padding_mode: str = "zeros",
+    augment: Names = (),
+    reduce: Names | None = None,
+    near: float = 1e-6,
+    backend: str = "auto",
+) -> Unprojected:
+    """`unproject` after the projection, for cameras that are no matrix: fisheye, distorted, panoramic.
+
+    Args:
+        features: (B, V, C, h, w).
+        pixels: (B, V, N, 2) as u, v in the feature map's own pixels, integer centres, float32 or float64.
+        depth: (B, V, N) of the sites, of the pixels' dtype; what `near` is compared with.
+        valid: (B, V, N) bool; where it is False nothing is read and all channels are 0.
+        mode: "bilinear" or "nearest".
+        padding_mode: "zeros" or "border".
+        augment: "depth" to append the depth. (There is no matrix to take a ray direction from.)
+        reduce: as in `unproject`.
+        near: least depth of a visible site, world units.
+        backend: as in `unproject`.
+
+    Returns:
+        ``volume`` (B, V, C', N), or (B, C'', N) with `reduce`, and ``visible`` (B, V, N) bool. Differentiable in
+        features, pixels and depth.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, GridError, OptionError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import functional
+        >>> features = torch.arange(5.0).expand(1, 1, 1, 5, 5)
+        >>> pixels = torch.tensor([[[[1.25, 2.0], [3.5, 0.0]]]])
+        >>> functional.sample_views(features, pixels, torch.ones(1, 1, 2), torch.ones(1, 1, 2, dtype=torch.bool)).volume
+        tensor([[[[1.2500, 3.5000]]]])
+    """
+    who = "sample_views"
+    options = Options.checked(
+        who, volume=False, mode=mode, padding_mode=padding_mode, augment=augment, reduce=reduce, near=near
+    )
+    if options.direction:
+        raise OptionError(f"{who}: augment must be 'depth' or nothing, a direction needs a camera; got {augment!r}")
+    kernels.check_backend(who, backend)
+    views = _check_features(who, features)
+    check_float(who, "pixels", pixels, "(B, V, N, 2)", rank=4, dtypes=(torch.float32, torch.float64))
+    if tuple(pixels.shape[:2]) != views or pixels.shape[3] != 2:
+        raise ShapeError(f"{who}: pixels must be (B, V, N, 2) with (B, V) = {views}; got {tuple(pixels.shape)}")
+    check_float(who, "depth", depth, "(B, V, N)", rank=3, dtypes=(pixels.dtype,))
+    if depth.shape != pixels.shape[:3]:
+        raise ShapeError(f"{who}: depth must be (B, V, N) = {tuple(pixels.shape[:3])}; got {tuple(depth.shape)}")
+    check_mask(who, "valid", valid, tuple(pixels.shape[:3]), "(B, V, N)")
+    check_devices(who, features=features, pixels=pixels, depth=depth, valid=valid)
+    if can_inspect(pixels):
+        finite = pixels.isfinite().all(-1) & depth.isfinite()
+        if not bool((finite | ~valid).all()):
+            raise GridError(f"{who}: pixels and depth must be finite where valid")
+    arguments = (pixels, depth, valid)
+    return Unprojected(*kernels.run("sample_views", features, *arguments, options=options, backend=backend))
+
+
+def plane_sweep_project(
+    volume: Tensor,
+    cameras: Cameras,
+    grid: VoxelGrid,
+    depths: Tensor,
+    size: tuple[int, int] | None = None,
+    *,
+    view_mask: Tensor | None = None,
+    mode: str = "trilinear",
+    padding_mode: str = "zeros",
+    augment: Names = (),
+    direction_frame: str = "world",
+    flatten: bool = True,
+    near: float = 1e-6,
+    backend: str = "auto",
+) -> Projected:
+    """Read a volume along the rays of cameras, at planes of constant depth.
+
+    Equation: ``m(u, v, k) = G(A^-1 X)`` with ``X = R^T (depth[k] K^-1 (u, v, 1) - t)``, A the grid's world from index,
+    G the volume interpolated (Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017, section 3).
+
+    Convention:
+        Integer pixel centres, K resized to `size`. A sample is visible where its index lies in [-0.5, n - 0.5) on each
+        axis of the volume and its plane is beyond `near`.
+
+    Args:
+        volume: (B, C, D, H, W), float16, bfloat16, float32 or float64.
+        cameras: B*V cameras, view fastest: a kornia ``PinholeCamera`` or ``PinholeCamerasList``, or `CameraTensors`.
+        grid: the `VoxelGrid` on which the volume lives.
+        depths: (P,), (B, P) or (B, V, P) camera z in world units, positive, strictly ascending, float32 or float64.
+        size: (h, w) of the maps; by default the cameras' image size, which must then be one.
+        view_mask: (B, V) bool; views where it is False give zeros and are unread.
+        mode: "trilinear", or "nearest": the voxel that contains the sample.
+        padding_mode: "zeros" or "border".
+        augment: "depth" and "direction": append the plane's depth, then the unit ray direction.
+        direction_frame: "world" or "camera".
+        flatten: whether channels and planes share an axis, index ``c * P + k``.
+        near: least depth of a visible plane, world units.
+        backend: "auto", or the name of one.
+
+    Returns:
+        ``maps`` (B, V, C' P, h, w), or (B, V, C', P, h, w) where `flatten` is False, and ``visible`` (B, V, P, h, w).
+        Differentiable in the volume, K, R, t, the depths and the grid's pose.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, CameraError, GridError, OptionError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import VoxelGrid, depth_planes, functional
+        >>> from lsmgeo.cameras import orbit
+        >>> camera = orbit(torch.tensor([[0.0]]), 0.0, 2.0, focal_length=8.0, height=3, width=3)
+        >>> grid = VoxelGrid(4)
+        >>> volume = grid.centers()[..., 0][None, None]  # each voxel holds its x
+        >>> maps, _ = functional.plane_sweep_project(volume, camera, grid, depth_planes(1.75, 2.25, 3))
+        >>> maps[0, 0, :, 1, 1]  # the camera looks along -x from x = 2
+        tensor([ 0.2500,  0.0000, -0.2500])
+    """
+    who = "PlaneSweepProject"
+    options = Options.checked(
+        who,
+        volume=True,
+        mode=mode,
+        padding_mode=padding_mode,
+        augment=augment,
+        direction_frame=direction_frame,
+        near=near,
+    )
+    kernels.check_backend(who, backend)
+    if not isinstance(flatten, bool):
+        raise OptionError(f"{who}: flatten must be True or False; got {describe(flatten)}")
+    sites = sweep_sites(who, volume, cameras, grid, depths, size, view_mask, options)
+    maps, visible = kernels.run("plane_sweep_project", volume, sites, options=options, backend=backend)
+    return Projected(maps.flatten(2, 3) if flatten else maps, visible)
+
+
+def view_statistics(volume: Tensor, visible: Tensor, statistics: Names, view_mask: Tensor | None = None) -> Tensor:
+    """Mean, population variance or maximum over the views that see a site; what `unproject` does with `reduce`.
+
+    Args:
+        volume: (B, V, C, *sites).
+        visible: (B, V, *sites) bool.
+        statistics: "mean", "variance" (mean of squares about the mean), "max" (its gradient goes to the first view that
+            attains it), or several.
+        view_mask: (B, V) bool; views where it is False do not count.
+
+    Returns:
+        (B, C'', *sites): blocks of C channels in the order asked; 0 where no view sees the site.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, OptionError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import functional
+        >>> volume = torch.tensor([1.0, 3.0, 8.0]).reshape(1, 3, 1, 1)
+        >>> visible = torch.tensor([True, True, False]).reshape(1, 3, 1)
+        >>> functional.view_statistics(volume, visible, ("mean", "variance", "max")).flatten()
+        tensor([2., 1., 3.])
+    """
+    who = "view_statistics"
+    names = check_choices(who, "statistics", statistics, STATISTICS)
+    if not names:
+        raise OptionError(f"{who}: statistics must name at least one; got {statistics!r}")
+    check_float(who, "volume", volume, "(B, V, C, ...)")
+    if volume.dim() < 3 or volume.shape[1] < 1:
+        raise ShapeError(f"{who}: volume must be (B, V, C, ...) with V at least 1; got {tuple(volume.shape)}")
+    check_mask(who, "visible", visible, (*volume.shape[:2], *volume.shape[3:]), "(B, V, ...)")
+    if view_mask is not None:
+        check_mask(who, "view_mask", view_mask, tuple(volume.shape[:2]), "(B, V)")
+        visible = visible & view_mask.reshape(*view_mask.shape, *(1,) * (visible.dim() - 2))
+    check_devices(who, volume=volume, visible=visible, view_mask=view_mask)
+    computing = volume if volume.dtype == torch.float64 else volume.float()
+    largest = torch.finfo(volume.dtype).max
+    return _view_statistics(computing, visible, names).clamp(-largest, largest).to(volume.dtype)
+
+
+# From cameras and grids to sites
+
+
+def _check_features(who: str, features: Tensor, count: int | None = None) -> tuple[int, int]:
+    expected = "(B, V, C, h, w)" if count is None else f"(B, V, C, h, w) with B*V = {count} cameras"
+    check_float(who, "features", features, expected)
+    if features.dim() != 5:
+        raise ShapeError(f"{who}: features must be {expected}; got {tuple(features.shape)}")
+    B, V, _, h, w = features.shape
+    if V < 1 or h < 1 or w < 1:
+        raise ShapeError(f"{who}: features must be {expected}, V, h and w at least 1; got {tuple(features.shape)}")
+    if count is not None and B * V != count:
+        raise ShapeError(f"{who}: features must be {expected}; got {tuple(features.shape)}, that is {B * V}")
+    return B, V
+
+
+def _camera_count(cameras: CameraTensors) -> int:
+    count = 1
+    for size in cameras.cam_from_world.shape[:-2]:
+        count *= size
+    return count
+
+
+def _views(
+    who: str, cameras: CameraTensors, views: tuple[int, int], view_mask: Tensor | None, **tensors: Tensor
+) -> CameraTensors:
+    """Bring cameras to leading shape (B, V) and check them."""
+    leading = tuple(cameras.cam_from_world.shape[:-2])
+    if leading != views and leading != (views[0] * views[1],):
+        raise ShapeError(
+            f"{who}: cameras must have leading shape (B, V) = {views}, or (B*V,) with the view fastest; got {leading}"
+        )
+    if view_mask is not None:
+        check_mask(who, "view_mask", view_mask, views, "(B, V)")
+    check_devices(who, **tensors, cameras=cameras.intrinsics, view_mask=view_mask)
+    if leading != views:
+        height, width = (size.reshape(views) for size in image_sizes(cameras))
+        K, E = cameras.intrinsics.reshape(*views, 3, 3), cameras.cam_from_world.reshape(*views, 4, 4)
+        cameras = CameraTensors(K, E, height, width)
+    check_cameras(who, cameras, view_mask)
+    return cameras
+
+
+def _image_matrices(who: str, features: Tensor, cameras: Cameras, view_mask: Tensor | None) -> CameraMatrices:
+    tensors = as_tensors(cameras, who)
+    views = _check_features(who, features, _camera_count(tensors))
+    tensors = _views(who, tensors, views, view_mask, features=features)
+    return camera_matrices(tensors, (features.shape[3], features.shape[4]), view_mask)
+
+
+def _lattice(who: str, grid: Grid | None, source: Tensor) -> Lattice:
+    if not isinstance(grid, VoxelGrid | FrustumGrid):
+        raise DTypeError(f"{who}: grid must be a VoxelGrid or a FrustumGrid; got {describe(grid)}")
+    lattice = grid.lattice()
+    if not isinstance(source, Tensor):
+        return lattice
+    for tensor in (lattice.world_from_lattice, lattice.z):
+        if tensor.dim() > 1 + (tensor is lattice.world_from_lattice) and tensor.shape[0] != source.shape[0]:
+            raise ShapeError(
+                f"{who}: grid must be of one scene or of B = {source.shape[0]}; got {tensor.shape[0]} scenes"
+            )
+    return lattice.to(source.device)
+
+
+def _direction_matrix(matrices: CameraMatrices, T: Tensor, frame: str) -> Tensor:
+    """G, (B, V, 3, 4), whose ``G q`` points from the camera centre to the site."""
+    if frame == "camera":
+        extrinsics = torch.cat((matrices.rotation, matrices.translation[..., None]), -1)
+        return multiply(extrinsics, T)
+    return T[..., :3, :] - matrices.center[..., None] * T[..., 3:, :]
+
+
+def _image_sites(
+    who: str,
+    features: Tensor,
+    cameras: Cameras,
+    lattice: Lattice,
+    view_mask: Tensor | None,
+    options: Options,
+) -> Sites:
+    matrices = _image_matrices(who, features, cameras, view_mask)
+    T, x, y, z, projective = lattice
+    T = T if T.dim() == 2 else T[:, None]  # (B, 1, 4, 4): shared by the views
+    direction = _direction_matrix(matrices, T, options.direction) if options.direction else None
+    return Sites(multiply(matrices.projection, T), direction, x, y, z, projective, view_mask)
+
+
+def sweep_sites(
+    who: str,
+    volume: Tensor,
+    cameras: Cameras,
+    grid: VoxelGrid,
+    depths: Tensor,
+    size: tuple[int, int] | None,
+    view_mask: Tensor | None,
+    options: Options,
+) -> Sites:
+    """The sites of the views' frustums as a volume sees them, everything checked."""
+    check_float(who, "volume", volume, "(B, C, D, H, W)", rank=5)
+    if not isinstance(grid, VoxelGrid):
+        raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
+    if tuple(volume.shape[2:]) != grid.shape:
+        raise ShapeError(
+            f"{who}: volume must be (B, C, D, H, W) with the grid's (D, H, W) = {grid.shape}; got {tuple(volume.shape)}"
+        )
+    tensors = as_tensors(cameras, who)
+    count, scenes = _camera_count(tensors), volume.shape[0]
+    leading = tensors.cam_from_world.shape[:-2]
+    if len(leading) == 2:
+        views = (leading[0], leading[1])
+        if leading[0] != scenes:
+            raise ShapeError(f"{who}: cameras must be (B, V) with the volume's B = {scenes}; got {tuple(leading)}")
+    else:
+        # With no scene the number of views cannot be told, and 1 is as good as any.
+        if scenes == 0 and count == 0:
+            views = (0, 1)
+        elif scenes == 0 or count % scenes:
+            raise ShapeError(f"{who}: cameras must be B*V with the volume's B = {scenes}; got {count}")
+        else:
+            views = (scenes, count // scenes)
+    if views[1] < 1:
+        raise ShapeError(f"{who}: cameras must hold at least one view a scene; got none")
+    lattice = _lattice(who, grid, volume)
+    tensors = _views(who, tensors, views, view_mask, volume=volume)
+    check_depths(who, depths, "(P,), (B, P) or (B, V, P)", view_mask)
+    if depths.dim() > 1 and tuple(depths.shape[:-1]) != views[: depths.dim() - 1]:
+        raise ShapeError(
+            f"{who}: depths must be (P,), (B, P) or (B, V, P) with (B, V) = {views}; got {tuple(depths.shape)}"
+        )
+    check_devices(who, volume=volume, depths=depths)
+    size = common_size(who, tensors) if size is None else check_size(who, "size", size, 2, "(h, w)")  # type: ignore[assignment]
+    assert size is not None
+    matrices = camera_matrices(tensors, size, view_mask)
+    frustum = matrices.world_from_frustum
+    inverse = affine_inverse(lattice.world_from_lattice)[..., :3, :]
+    matrix = multiply(inverse if inverse.dim() == 2 else inverse[:, None], frustum)
+    direction = _direction_matrix(matrices, frustum, options.direction) if options.direction else None
+    x, y = (torch.arange(n, dtype=torch.float64, device=volume.device) for n in (size[1], size[0]))
+    if view_mask is not None and depths.dim() == 3:
+        depths = torch.where(view_mask[..., None], depths, 1.0)
+    return Sites(matrix, direction, x, y, 1.0 / depths.double(), True, view_mask)

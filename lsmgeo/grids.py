@@ -1,0 +1,344 @@
+"""Lattices of sites in the world: voxel grids, camera frustums, depth planes.
+
+A lattice is a regular array of sites with homogeneous index ``q = (x[i], y[j], z[k], 1)`` and homogeneous world
+position ``X ~ T q``. `VoxelGrid` counts x, y, z = 0, 1, 2, ... with T affine; `FrustumGrid` has ``z[k] = 1 / depth[k]`` and T
+projective. Nothing else distinguishes them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from lsmgeo._checks import check_choice, check_devices, check_float, check_number, check_size, describe
+from lsmgeo._linalg import affine_inverse, inverse_3x3, multiply
+from lsmgeo.cameras.matrices import camera_matrices
+from lsmgeo.cameras.tensors import CAMERA_DTYPES, CameraTensors, as_tensors, check_cameras
+from lsmgeo.cameras.transforms import common_size
+from lsmgeo.debugging import can_inspect
+from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
+
+__all__ = ["FrustumGrid", "Lattice", "VoxelGrid", "depth_planes"]
+
+
+class Lattice(NamedTuple):
+    """A lattice in float64: T (4, 4) or (B, 4, 4); x (W,), y (H,), z (D,) or (B, D); whether T is projective."""
+
+    world_from_lattice: Tensor
+    x: Tensor
+    y: Tensor
+    z: Tensor
+    projective: bool
+
+    def to(self, device: torch.device) -> Lattice:
+        """The same lattice on another device."""
+        return self._replace(**{name: getattr(self, name).to(device) for name in self._fields[:4]})
+
+    def centers(self) -> Tensor:
+        """World positions of the sites, (D, H, W, 3) or (B, D, H, W, 3)."""
+        T, x, y, z, projective = self
+        plane = T[..., :3, 0, None, None] * x + (T[..., :3, 1, None, None] * y[:, None] + T[..., :3, 3, None, None])
+        line = T[..., :3, 2, None] * z[..., None, :]  # (B?, 3, D)
+        points = plane[..., None, :, :] + line[..., None, None]
+        if projective:
+            points = points / z[..., None, :, None, None]
+        return points.movedim(-4, -1)  # (B?, D, H, W, 3)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class VoxelGrid:
+    """A box of voxels: an immutable value, no module; it follows the features' device and is never cast.
+
+    Convention:
+        Arrays over the grid are (..., D, H, W) with D along z, H along y, W along x. Voxel i of n between lower and
+        upper is centred at ``lower + (i + 0.5) (upper - lower) / n``.
+
+    Args:
+        shape: (D, H, W), or one int for all three.
+        lower: lower bounds of the box in world units, a number or (x, y, z).
+        upper: upper bounds of the box.
+        world_from_grid: affine (4, 4) or, one for each scene, (B, 4, 4), float32 or float64, applied to the metric box:
+            any pose and, if wanted, scale or shear. Gradients flow to it.
+
+    Raises:
+        GridError: no voxels, more than 2^31 - 1, crossed or non-finite bounds, a singular or projective matrix.
+
+    Example:
+        >>> from lsmgeo import VoxelGrid
+        >>> VoxelGrid(2).centers()[0, 0]
+        tensor([[-0.2500, -0.2500, -0.2500],
+                [ 0.2500, -0.2500, -0.2500]])
+        >>> VoxelGrid((4, 3, 2), lower=(0, 0, 0), upper=(2, 3, 4))
+        VoxelGrid((4, 3, 2), lower=(0.0, 0.0, 0.0), upper=(2.0, 3.0, 4.0))
+    """
+
+    shape: int | tuple[int, int, int]
+    lower: float | Sequence[float] = -0.5
+    upper: float | Sequence[float] = 0.5
+    world_from_grid: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        """Check and normalise the fields."""
+        object.__setattr__(self, "shape", _grid_shape("VoxelGrid", self.shape))
+        for name in ("lower", "upper"):
+            object.__setattr__(self, name, _bounds(name, getattr(self, name)))
+        for axis, low, high in zip("xyz", self.lower, self.upper, strict=True):  # type: ignore[arg-type]
+            if not low < high:
+                raise GridError(f"VoxelGrid: lower must be below upper on every axis; got {low} and {high} in {axis}")
+        matrix = self.world_from_grid
+        if matrix is None:
+            return
+        check_float("VoxelGrid", "world_from_grid", matrix, "(4, 4) or (B, 4, 4)", dtypes=CAMERA_DTYPES)
+        if matrix.dim() not in (2, 3) or tuple(matrix.shape[-2:]) != (4, 4):
+            raise ShapeError(f"VoxelGrid: world_from_grid must be (4, 4) or (B, 4, 4); got {tuple(matrix.shape)}")
+        if can_inspect(matrix):
+            with torch.no_grad():
+                double = matrix.double()
+                if not bool(double.isfinite().all()):
+                    raise GridError("VoxelGrid: world_from_grid must be finite")
+                if not bool(((double[..., 3, :] - double.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() <= 1e-3).all()):
+                    raise GridError("VoxelGrid: world_from_grid must be affine, its last row (0, 0, 0, 1)")
+                if not bool(inverse_3x3(double[..., :3, :3]).isfinite().all()):
+                    raise GridError("VoxelGrid: world_from_grid must be invertible")
+
+    def __repr__(self) -> str:
+        """The call that makes this grid (a matrix is shown by its shape)."""
+        text = f"VoxelGrid({self.shape}, lower={self.lower}, upper={self.upper}"
+        if self.world_from_grid is not None:
+            text += f", world_from_grid=<{tuple(self.world_from_grid.shape)} {self.world_from_grid.dtype}>"
+        return text + ")"
+
+    @property
+    def world_from_lattice(self) -> Tensor:
+        """World from voxel index, (4, 4) or (B, 4, 4), float64: ``X = A (i_x, i_y, i_z, 1)``."""
+        lower, upper = self.lower, self.upper
+        counts = tuple(reversed(self.shape))  # type: ignore[arg-type]
+        steps = [(high - low) / n for low, high, n in zip(lower, upper, counts, strict=True)]  # type: ignore[arg-type]
+        rows = [[0.0] * 4 for _ in range(4)]
+        for axis, (step, low) in enumerate(zip(steps, lower, strict=True)):  # type: ignore[arg-type]
+            rows[axis][axis], rows[axis][3] = step, low + 0.5 * step
+        rows[3][3] = 1.0
+        device = None if self.world_from_grid is None else self.world_from_grid.device
+        box = torch.tensor(rows, dtype=torch.float64, device=device)
+        if self.world_from_grid is None:
+            return box
+        last = box[3:].expand(*self.world_from_grid.shape[:-2], 1, 4)
+        return multiply(torch.cat((self.world_from_grid[..., :3, :].double(), last), -2), box)
+
+    @property
+    def lattice_from_world(self) -> Tensor:
+        """Voxel index from world, (4, 4) or (B, 4, 4), float64."""
+        return affine_inverse(self.world_from_lattice)
+
+    def lattice(self) -> Lattice:
+        """The grid as the operators see it."""
+        T = self.world_from_lattice
+        depth, height, width = self.shape  # type: ignore[misc]
+        x, y, z = (torch.arange(n, dtype=T.dtype, device=T.device) for n in (width, height, depth))
+        return Lattice(T, x, y, z, False)
+
+    def centers(self) -> Tensor:
+        """Voxel centres in the world as x, y, z, (D, H, W, 3) or (B, D, H, W, 3), of `world_from_grid`'s dtype if any."""
+        dtype = torch.get_default_dtype() if self.world_from_grid is None else self.world_from_grid.dtype
+        return self.lattice().centers().to(dtype)
+
+
+def _grid_shape(who: str, value: object) -> tuple[int, int, int]:
+    try:
+        depth, height, width = check_size(who, "shape", value, 3, "an int or (D, H, W)")
+    except ShapeError as error:
+        raise GridError(str(error)) from None
+    if depth * height * width > 2**31 - 1:
+        raise GridError(f"{who}: shape must hold at most 2^31 - 1 sites; got {(depth, height, width)}")
+    return depth, height, width
+
+
+def _bounds(name: str, value: object) -> tuple[float, float, float]:
+    if isinstance(value, Tensor):
+        raise DTypeError(f"VoxelGrid: {name} must be numbers (gradients go to world_from_grid); got {describe(value)}")
+    values = tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else (value,) * 3
+    if len(values) != 3:
+        raise GridError(f"VoxelGrid: {name} must be a number or (x, y, z); got {describe(value)}")
+    try:
+        x, y, z = (check_number("VoxelGrid", name, item, "a finite number or (x, y, z)") for item in values)
+    except OptionError as error:
+        raise GridError(str(error)) from None
+    return x, y, z
+
+
+def check_depths(who: str, depths: Tensor, expected: str = "(P,) or (B, P)", view_mask: Tensor | None = None) -> None:
+    """Require float32 or float64 depths, at least one, positive and strictly ascending along the last axis."""
+    check_float(who, "depths", depths, expected, dtypes=CAMERA_DTYPES)
+    if depths.dim() < 1 or depths.dim() > expected.count("(") or depths.shape[-1] < 1:
+        raise ShapeError(f"{who}: depths must be {expected} with P at least 1; got {tuple(depths.shape)}")
+    if not can_inspect(depths):
+        return
+    with torch.no_grad():
+        good = (depths > 0).all(-1) & depths.isfinite().all(-1) & (depths.diff(dim=-1) > 0).all(-1)
+        if view_mask is not None and depths.dim() == 3:
+            good = good | ~view_mask
+        if not bool(good.all()):
+            row = depths[tuple((~good).nonzero()[0].tolist())]
+            raise GridError(
+                f"{who}: depths must be positive, finite and strictly ascending; got "
+                f"{[float(f'{item:.6g}') for item in row[:6].tolist()]}{'...' if row.numel() > 6 else ''}"
+            )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrustumGrid:
+    """The frustum of one camera a scene, cut into fronto-parallel planes: the sites of a plane-sweep volume.
+
+    Equation: site (k, j, i) is at the depth[k] point of the ray of pixel (i, j): ``X ~ T (i, j, 1/depth[k], 1)``,
+    ``T = [[R^T K^-1[:, :2], -R^T t, R^T K^-1[:, 2:]], [0, 0, 1, 0]]``.
+
+    Args:
+        camera: one camera a scene, leading shape () or (B,): a kornia ``PinholeCamera`` or `CameraTensors`.
+        depths: (P,) or (B, P) camera z in world units, positive, strictly ascending; see `depth_planes`.
+        size: (h, w) of the planes, for which K is resized; by default the camera's image size.
+
+    Gradients flow to the camera and to the depths.
+
+    Raises:
+        GridError: depths out of order, too many sites.
+        ShapeError: more than one camera a scene.
+        CameraError: a camera that is no rigid pinhole camera.
+
+    Example:
+        >>> from lsmgeo import FrustumGrid, depth_planes
+        >>> from lsmgeo.cameras import orbit
+        >>> camera = orbit(0.0, 0.0, 2.0, focal_length=10.0, height=3, width=3)
+        >>> FrustumGrid(camera, depth_planes(1.0, 3.0, 2)).centers()[:, 1, 1]
+        tensor([[ 1.,  0.,  0.],
+                [-1.,  0.,  0.]])
+    """
+
+    camera: PinholeCamera | CameraTensors
+    depths: Tensor
+    size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        """Check and normalise the fields."""
+        who = "FrustumGrid"
+        camera = as_tensors(self.camera, who)
+        leading = tuple(camera.cam_from_world.shape[:-2])
+        if len(leading) > 1:
+            raise ShapeError(f"{who}: camera must have leading shape () or (B,), one a scene; got {leading}")
+        check_cameras(who, camera)
+        check_depths(who, self.depths)
+        if leading and self.depths.dim() == 2 and self.depths.shape[0] != leading[0]:
+            raise ShapeError(
+                f"{who}: depths must be (P,) or (B, P) with B = {leading[0]} cameras; got {tuple(self.depths.shape)}"
+            )
+        check_devices(who, camera=camera.intrinsics, depths=self.depths)
+        size = common_size(who, camera) if self.size is None else check_size(who, "size", self.size, 2, "(h, w)")
+        _grid_shape(who, (self.depths.shape[-1], *size))
+        object.__setattr__(self, "camera", camera)
+        object.__setattr__(self, "size", tuple(size))
+
+    def __repr__(self) -> str:
+        """Shape and number of scenes."""
+        scenes = tuple(self.world_from_lattice.shape[:-2])
+        return f"FrustumGrid(shape={self.shape}, scenes={scenes[0] if scenes else 'shared'})"
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(P, h, w)."""
+        assert self.size is not None
+        return (self.depths.shape[-1], *self.size)
+
+    @property
+    def world_from_lattice(self) -> Tensor:
+        """Homogeneous world from (u, v, 1/depth, 1), (4, 4) or (B, 4, 4), float64."""
+        return camera_matrices(as_tensors(self.camera), self.size).world_from_frustum
+
+    @property
+    def lattice_from_world(self) -> Tensor:
+        """(u, v, 1/depth, 1) up to a factor from homogeneous world, (4, 4) or (B, 4, 4), float64."""
+        matrices = camera_matrices(as_tensors(self.camera), self.size)
+        P = matrices.projection
+        last = P.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*P.shape[:-2], 4)
+        return torch.stack((P[..., 0, :], P[..., 1, :], last, P[..., 2, :]), -2)
+
+    def lattice(self) -> Lattice:
+        """The grid as the operators see it."""
+        T = self.world_from_lattice
+        _, height, width = self.shape
+        x, y = (torch.arange(n, dtype=T.dtype, device=T.device) for n in (width, height))
+        return Lattice(T, x, y, 1.0 / self.depths.double(), True)
+
+    def centers(self) -> Tensor:
+        """Site positions in the world, (P, h, w, 3) or (B, P, h, w, 3) as x, y, z, of the depths' dtype."""
+        return self.lattice().centers().to(self.depths.dtype)
+
+
+def depth_planes(near: float | Tensor, far: float | Tensor, num: int, spacing: str = "depth") -> Tensor:
+    """Depths of sweep planes from near to far, both ends included.
+
+    Equation: with a in [0, 1] evenly spaced, "depth": near + a (far - near); "inverse":
+    1 / (1/near + a (1/far - 1/near)); "log": near (far / near)^a. "inverse" moves a sample by even steps in a second view.
+
+    Args:
+        near: first depth, positive, world units; a number, or (B,) for depths of each scene.
+        far: last depth, larger; a number or (B,).
+        num: number of planes, at least 1; 1 gives near.
+        spacing: "depth", "inverse" or "log".
+
+    Returns:
+        (num,) or (B, num), strictly ascending, differentiable in near and far.
+
+    Raises:
+        GridError: near and far not positive and ascending, or no planes.
+        OptionError: an unknown spacing.
+
+    Example:
+        >>> from lsmgeo import depth_planes
+        >>> depth_planes(1.0, 4.0, 4)
+        tensor([1., 2., 3., 4.])
+        >>> depth_planes(1.0, 4.0, 3, spacing="log")
+        tensor([1., 2., 4.])
+        >>> depth_planes(1.0, 4.0, 3, spacing="inverse")
+        tensor([1.0000, 1.6000, 4.0000])
+    """
+    who = "depth_planes"
+    check_choice(who, "spacing", spacing, ("depth", "inverse", "log"))
+    if not isinstance(num, int) or isinstance(num, bool) or num < 1:
+        raise GridError(f"{who}: num must be an integer, at least 1; got {describe(num)}")
+    given = [value for value in (near, far) if isinstance(value, Tensor)]
+    like = given[0] if given else torch.zeros(())
+    ends = []
+    for name, value in (("near", near), ("far", far)):
+        if isinstance(value, Tensor):
+            check_float(who, name, value, "a number or (B,)", dtypes=CAMERA_DTYPES)
+            if value.dim() > 1:
+                raise ShapeError(f"{who}: {name} must be a number or (B,); got {tuple(value.shape)}")
+        else:
+            try:
+                value = like.new_tensor(check_number(who, name, value, "a finite number"))
+            except OptionError as error:
+                raise GridError(str(error)) from None
+        ends.append(value)
+    check_devices(who, near=ends[0], far=ends[1])
+    if ends[0].dtype != ends[1].dtype:
+        raise DTypeError(f"{who}: near and far must be of one dtype; got {ends[0].dtype} and {ends[1].dtype}")
+    if ends[0].dim() and ends[1].dim() and ends[0].shape != ends[1].shape:
+        raise ShapeError(f"{who}: near and far must agree; got {tuple(ends[0].shape)} and {tuple(ends[1].shape)}")
+    first, last = torch.broadcast_tensors(*ends)
+    if can_inspect(first) and not bool(((first > 0) & (first < last) & last.isfinite()).all()):
+        raise GridError(f"{who}: near and far must be positive, finite and ascending; got {near} and {far}")
+    first, last = first[..., None], last[..., None]
+    a = torch.linspace(0.0, 1.0, num, dtype=first.dtype, device=first.device)
+    if spacing == "depth":
+        planes = first * (1.0 - a) + last * a
+    elif spacing == "inverse":
+        planes = 1.0 / ((1.0 - a) / first + a / last)
+    else:
+        planes = torch.exp((1.0 - a) * torch.log(first) + a * torch.log(last))
+    if num == 1:
+        return first.expand(planes.shape).clone()
+    return torch.cat((first, planes[..., 1:-1], last), -1)  # the ends exactly

@@ -1,0 +1,95 @@
+"""Kernels: resampling between a lattice and an array through a matrix. They know neither cameras nor grids.
+
+This module is the one place where a backend is chosen. A backend owns a predicate that says why it cannot run a call;
+"auto" takes the first of `BACKENDS` that can, a backend asked for by name runs or raises with its reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from lsmgeo._checks import check_choice
+from lsmgeo.errors import BackendError
+from lsmgeo.kernels import reference
+from lsmgeo.kernels.request import OPERATORS, Options, Sites
+
+__all__ = ["BACKENDS", "OPERATORS", "Backend", "Options", "Sites", "check_backend", "explain", "run", "select"]
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A set of kernels.
+
+    Args:
+        name: what a user asks for.
+        why_not: from (operator, source, options) to the reason why this backend cannot run it, or None.
+        operators: the kernels by operator name.
+    """
+
+    name: str
+    why_not: Callable[[str, Tensor, Options], str | None]
+    operators: Mapping[str, Callable[..., Any]]
+
+
+BACKENDS: tuple[Backend, ...] = (Backend("reference", reference.why_not, reference.OPERATORS),)
+
+
+def check_backend(who: str, name: object) -> str:
+    """Require "auto" or the name of a backend."""
+    return check_choice(who, "backend", name, ("auto", *(backend.name for backend in BACKENDS)))
+
+
+def select(operator: str, source: Tensor, options: Options, backend: str = "auto") -> Backend:
+    """The backend that runs this call."""
+    reasons = []
+    for candidate in BACKENDS:
+        if backend in ("auto", candidate.name):
+            reason = candidate.why_not(operator, source, options)
+            if reason is None:
+                return candidate
+            reasons.append(f"{candidate.name}: {reason}")
+    raise BackendError(f"{operator}: backend {backend!r} cannot run this call ({'; '.join(reasons)})")
+
+
+def run(operator: str, source: Tensor, *args: Any, options: Options, backend: str = "auto") -> Any:
+    """Run an operator on the backend that `select` names."""
+    return select(operator, source, options, backend).operators[operator](source, *args, options)
+
+
+def explain(operator: str, source: Tensor, **options: Any) -> str:
+    """Tell for each backend whether "auto" would take it for a call, and why not; also prints it.
+
+    Args:
+        operator: "unproject", "unproject_points", "sample_views", "plane_sweep_project" or "project_reduce".
+        source: the features or volume of the call.
+        **options: options of the call: mode, padding_mode, augment, reduce, near.
+
+    Returns:
+        One line a backend.
+
+    Raises:
+        OptionError: an unknown operator or option value.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import kernels
+        >>> _ = kernels.explain("unproject", torch.zeros(1, 2, 8, 16, 16))
+        unproject of (1, 2, 8, 16, 16) float32 on cpu
+          reference: taken
+    """
+    check_choice("explain", "operator", operator, OPERATORS)
+    call = Options.checked("explain", volume=operator in ("plane_sweep_project", "project_reduce"), **options)
+    lines = [f"{operator} of {tuple(source.shape)} {str(source.dtype).removeprefix('torch.')} on {source.device.type}"]
+    taken = False
+    for backend in BACKENDS:
+        reason = backend.why_not(operator, source, call)
+        verdict = reason if reason is not None else "can run, not needed" if taken else "taken"
+        taken = taken or reason is None
+        lines.append(f"  {backend.name}: {verdict}")
+    text = "\n".join(lines)
+    print(text)
+    return text

@@ -1,0 +1,414 @@
+"""The reference kernels: vectorised PyTorch, differentiable in everything, twice. The yardstick for all others.
+
+This module alone knows `grid_sample` and its `align_corners`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import reduce
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+from torch.utils.checkpoint import checkpoint
+
+from lsmgeo.debugging import is_traced
+from lsmgeo.kernels.request import Options, Sites
+from lsmgeo.kernels.statistics import view_statistics
+
+__all__ = ["OPERATORS", "why_not"]
+
+# Sites are sent here to read nothing: every tap is outside the array, for any interpolation.
+OUTSIDE = -2.0
+# Homogeneous coordinates are kept below 2^100, and a site counts as in front only beyond 2^-60, so that neither the
+# quotient's derivative nor anything before it overflows in float32.
+LARGEST_COORDINATE = 2.0**100
+SMALLEST_DEPTH = 2.0**-60
+
+
+def why_not(operator: str, source: Tensor, options: Options) -> str | None:
+    """The reference runs everything."""
+    return None
+
+
+def _computing_dtype(source: Tensor) -> torch.dtype:
+    return torch.float64 if source.dtype == torch.float64 else torch.float32
+
+
+def _to_output(values: Tensor, dtype: torch.dtype) -> Tensor:
+    """Cast, saturating: what is finite stays finite in half precision."""
+    if values.dtype == dtype:
+        return values
+    largest = torch.finfo(dtype).max
+    return values.clamp(-largest, largest).to(dtype)
+
+
+def _saturate(values: Tensor) -> Tensor:
+    largest = torch.finfo(values.dtype).max
+    return values.clamp(-largest, largest)
+
+
+# Geometry
+
+
+def _lattice_rows(matrix: Tensor, sites: Sites, dtype: torch.dtype) -> list[Tensor]:
+    """The three coordinates of ``M q``, each (B, V, D, H, W).
+
+    A lattice is separable: the terms in x and y are summed over a plane, those in z along a line, and the full array is
+    one sum of the two.
+    """
+    m = matrix.to(dtype)
+    line = m[..., 2, None] * _per_view(sites.z, matrix).to(dtype)[:, :, None]  # (B, V, 3, D)
+    plane = _plane_rows(m, sites)  # (B, V, 3, H, W)
+    return [plane[:, :, row, None] + line[:, :, row, :, None, None] for row in range(3)]
+
+
+def _plane_rows(m: Tensor, sites: Sites) -> Tensor:
+    """The terms of ``M q`` in x, y and 1, (B, V, 3, H, W)."""
+    x, y = sites.x.to(m.dtype), sites.y.to(m.dtype)
+    return m[..., 0, None, None] * x + (m[..., 1, None, None] * y[:, None] + m[..., 3, None, None])
+
+
+def _point_rows(matrix: Tensor, points: Tensor, dtype: torch.dtype) -> list[Tensor]:
+    """The three coordinates of ``M (X, 1)`` for points (B, N, 3), each (B, V, N)."""
+    m = matrix.to(dtype)
+    x, y, z = (axis[:, None] for axis in points.to(dtype).unbind(-1))  # (B, 1, N)
+    return [
+        m[..., row, 0, None] * x + m[..., row, 1, None] * y + m[..., row, 2, None] * z + m[..., row, 3, None]
+        for row in range(3)
+    ]
+
+
+def _per_view(z: Tensor, matrix: Tensor) -> Tensor:
+    """(D,), (B, D) or (B, V, D) -> (B, V, D)."""
+    if z.dim() == 2:
+        z = z[:, None]
+    return z.expand(*matrix.shape[:2], z.shape[-1])
+
+
+def _extent(matrix: Tensor, reach: Sequence[Tensor]) -> Tensor:
+    """A bound on every |coordinate| of ``M q``, (B, V), from bounds on |x|, |y| and |z|, each () or (B, V)."""
+    m = matrix.detach().abs().amax(-2)  # (B, V, 4)
+    return m[..., 0] * reach[0] + m[..., 1] * reach[1] + m[..., 2] * reach[2] + m[..., 3]
+
+
+def _lattice_extent(matrix: Tensor, sites: Sites) -> Tensor:
+    z = _per_view(sites.z.detach(), matrix).abs().amax(-1)
+    return _extent(matrix, (sites.x.abs().amax(), sites.y.abs().amax(), z))
+
+
+def _point_extent(matrix: Tensor, points: Tensor) -> Tensor:
+    reach = points.detach().double().abs().sum(1)  # (B, 3); the sum, unlike the maximum, exists for no points
+    return _extent(matrix, reach[:, None].unbind(-1))
+
+
+def _scale_below_overflow(extent: Tensor) -> Tensor:
+    """A factor 2^-k that brings `extent` to `LARGEST_COORDINATE` at most, 1 where it is small already."""
+    return torch.exp2(-torch.log2(extent.clamp_min(LARGEST_COORDINATE) / LARGEST_COORDINATE).ceil())
+
+
+def _unit(rows: Sequence[Tensor], view_mask: Tensor | None) -> Tensor:
+    """Normalise the vector (B, V, *sites) x 3, entries at most 1, to (B, V, 3, *sites); 0 with zero gradient at 0."""
+    vector = torch.stack(list(rows), 2)
+    squares = vector.square().sum(2, keepdim=True)
+    # A vector as short as the rounding error of its sum has no direction: the site is the camera centre.
+    away = squares > (4.0 * torch.finfo(vector.dtype).eps) ** 2
+    unit = torch.where(away, vector * torch.where(away, squares, 1.0).rsqrt(), 0.0)
+    return _masked(unit, view_mask)
+
+
+def _lattice_directions(sites: Sites, dtype: torch.dtype) -> Tensor:
+    assert sites.direction is not None
+    extent = _lattice_extent(sites.direction, sites).clamp_min(torch.finfo(torch.float64).tiny)
+    return _unit(_lattice_rows(sites.direction / extent[..., None, None], sites, dtype), sites.view_mask)
+
+
+def _masked(values: Tensor, view_mask: Tensor | None) -> Tensor:
+    """(B, V, ...) with the left-out views at 0."""
+    return values if view_mask is None else torch.where(_aligned(view_mask, values.dim()), values, 0.0)
+
+
+def _aligned(per_view: Tensor, dim: int) -> Tensor:
+    """(B, V) -> (B, V, 1, ...) of `dim` axes."""
+    return per_view.reshape(*per_view.shape, *(1,) * (dim - 2))
+
+
+# Sampling
+
+
+def _coordinate(index: Tensor, size: int, options: Options, differentiable: bool) -> Tensor:
+    """From an array index to `grid_sample`'s coordinate, ``(2 u + 1) / n - 1`` for ``align_corners=False``."""
+    if options.mode == "nearest":
+        # The cell that contains the sample; grid_sample would round half to even.
+        index = torch.floor(index.detach() + 0.5)
+        differentiable = False
+    if options.padding_mode == "border":
+        # No gradient at and beyond the outermost centres.
+        index = torch.where((index > 0) & (index < size - 1), index, index.detach().clamp(0, size - 1))
+    else:
+        index = index.clamp(OUTSIDE, size + 1)  # all taps are outside there too; infinity would give NaN
+    coordinate = torch.add(index.new_tensor(1.0 / size - 1.0), index, alpha=2.0 / size)
+    if differentiable:
+        # grid_sample undoes this with rounding errors of a few ulp. An index that is an integer must not fall into the
+        # cell below: its derivative is that of the cell above.
+        whole = index.detach()
+        coordinate = torch.add(coordinate, whole == whole.floor(), alpha=4.0 * torch.finfo(index.dtype).eps)
+    return coordinate
+
+
+def _sample(source: Tensor, index: Sequence[Tensor], front: Tensor, options: Options) -> tuple[Tensor, Tensor]:
+    """Interpolate arrays at fractional indices.
+
+    Args:
+        source: (B, V, C, *sizes), sizes (h, w) or (D, H, W).
+        index: fractional indices x, y(, z), each (B, V, *sites); `OUTSIDE` where not in front.
+        front: broadcasts to (B, V, *sites), False where the source must not be read.
+        options: mode and padding_mode.
+
+    Returns:
+        Values (B, V, C, *sites), exactly 0 where not in front, and visibility (B, V, *sites).
+    """
+    sizes = tuple(reversed(source.shape[3:]))  # x, y(, z)
+    inside = [(axis >= -0.5) & (axis < size - 0.5) for axis, size in zip(index, sizes, strict=True)]
+    visible = reduce(torch.logical_and, inside)
+    differentiable = is_traced() or any(axis.requires_grad for axis in index)
+    grid = torch.stack(
+        [_coordinate(axis, size, options, differentiable) for axis, size in zip(index, sizes, strict=True)], -1
+    )
+    grid = grid.flatten(0, 1)
+    if len(sizes) == 2:  # grid_sample wants as many axes of sites as the source has
+        grid = grid.flatten(1, -3) if grid.dim() > 3 else grid[:, None]
+    values = grid_sample(
+        source.flatten(0, 1),
+        grid,
+        mode="nearest" if options.mode == "nearest" else "bilinear",
+        padding_mode=options.padding_mode,
+        align_corners=False,
+    ).reshape(*source.shape[:3], *visible.shape[2:])
+    if options.padding_mode == "border":
+        values = values.masked_fill(~front[:, :, None], 0.0)
+    return values, visible
+
+
+def _output(values: Tensor, depth: Tensor | None, direction: Tensor | None, dtype: torch.dtype) -> Tensor:
+    """Values (B, V, C, *sites), with depth (B, V, *sites) and direction (B, V, 3, *sites) appended, in `dtype`.
+
+    What is finite stays finite: geometry saturates in every dtype, features where they are cast to a smaller one.
+    """
+    blocks = [_cast(values, dtype)]
+    if depth is not None:
+        largest = torch.finfo(depth.dtype).max
+        blocks.append(_cast(depth.clamp(-largest, largest), dtype)[:, :, None])
+    if direction is not None:
+        blocks.append(_cast(direction, dtype))
+    return torch.cat(blocks, 2) if len(blocks) > 1 else blocks[0]
+
+
+def _cast(values: Tensor, dtype: torch.dtype) -> Tensor:
+    if values.dtype == dtype:
+        return values
+    largest = torch.finfo(dtype).max
+    return values.clamp(-largest, largest).to(dtype)
+
+
+def _sample_through_cameras(
+    source: Tensor, rows: Sequence[Tensor], unit: Tensor, view_mask: Tensor | None, options: Options
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Sample images (B, V, C, h, w) at homogeneous pixels, rows of (B, V, *sites).
+
+    Args:
+        source: the images.
+        rows: x, y and z of ``M q``.
+        unit: broadcasts to the rows: the z of a site at depth 1.
+        view_mask: (B, V) or None.
+        options: of the call.
+
+    Returns:
+        Values (B, V, C, *sites), visibility, and depth or None.
+    """
+    x, y, z = rows
+    threshold = (options.near * unit).clamp_min(SMALLEST_DEPTH)
+    if view_mask is not None:
+        threshold = torch.where(_aligned(view_mask, z.dim()), threshold, torch.inf)
+    front = z > threshold
+    inverse = torch.where(front, z, 1.0).reciprocal()
+    index = [torch.where(front, axis * inverse, OUTSIDE) for axis in (x, y)]
+    values, visible = _sample(source, index, front, options)
+    return values, visible, _masked(z / unit, view_mask) if options.depth else None
+
+
+def _over_pieces(
+    piece: Callable[[int, int], tuple[Tensor, Tensor]], total: int, options: Options, views: int, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """Statistics over the views of `piece(start, stop)`, one piece of the sites' first axis after another.
+
+    The values of all views exist for one piece at a time; in backward they are made again.
+    """
+
+    def reduced(start: int, stop: int) -> tuple[Tensor, Tensor]:
+        values, visible = piece(start, stop)
+        return _cast(view_statistics(values, visible, options.reduce), dtype), visible
+
+    if is_traced():  # no loop whose length depends on a size, no recomputation by hand
+        return reduced(0, total)
+    step = max(1, -(-total // max(1, views)))
+    pieces = []
+    for start in range(0, max(1, total), step):
+        stop = min(start + step, total)
+        if torch.is_grad_enabled():
+            pieces.append(checkpoint(reduced, start, stop, use_reentrant=False, preserve_rng_state=False))
+        else:
+            pieces.append(reduced(start, stop))
+    return torch.cat([values for values, _ in pieces], 2), torch.cat([visible for _, visible in pieces], 2)
+
+
+# Operators
+
+
+def unproject(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
+    """Sample images (B, V, C, h, w) at the sites of a lattice.
+
+    Returns:
+        (B, V, C', D, H, W), or (B, C'', D, H, W) where options.reduce is set, and visibility (B, V, D, H, W).
+    """
+    dtype, output = _computing_dtype(source), source.dtype
+    source = source.to(dtype)
+    scale = _scale_below_overflow(_lattice_extent(sites.matrix, sites))[..., None]  # (B, V, 1)
+    matrix = sites.matrix * scale[..., None]  # homogeneous: a factor moves no pixel
+
+    def piece(start: int, stop: int) -> tuple[Tensor, Tensor]:
+        part = sites.slab(start, stop)
+        unit = (_per_view(part.z, matrix) * scale if part.projective else scale).to(dtype)[..., None, None]
+        rows = _lattice_rows(matrix, part, dtype)
+        values, visible, depth = _sample_through_cameras(source, rows, unit, part.view_mask, options)
+        direction = _lattice_directions(part, dtype) if options.direction else None
+        return _output(values, depth, direction, dtype if options.reduce else output), visible
+
+    total = sites.z.shape[-1]
+    return _over_pieces(piece, total, options, source.shape[1], output) if options.reduce else piece(0, total)
+
+
+def unproject_points(
+    source: Tensor, matrix: Tensor, direction: Tensor | None, points: Tensor, view_mask: Tensor | None, options: Options
+) -> tuple[Tensor, Tensor]:
+    """Sample images (B, V, C, h, w) at points (B, N, 3), with matrices (B, V, 3, 4) on (X, 1).
+
+    Returns:
+        (B, V, C', N), or (B, C'', N) where options.reduce is set, and visibility (B, V, N).
+    """
+    dtype, output = _computing_dtype(source), source.dtype
+    source = source.to(dtype)
+    scale = _scale_below_overflow(_point_extent(matrix, points))[..., None]  # (B, V, 1)
+    scaled = matrix * scale[..., None]
+
+    def piece(start: int, stop: int) -> tuple[Tensor, Tensor]:
+        part = points[:, start:stop]
+        rows = _point_rows(scaled, part, dtype)
+        values, visible, depth = _sample_through_cameras(source, rows, scale.to(dtype), view_mask, options)
+        vectors = None
+        if direction is not None:
+            extent = _point_extent(direction, points).clamp_min(torch.finfo(torch.float64).tiny)
+            vectors = _unit(_point_rows(direction / extent[..., None, None], part, dtype), view_mask)
+        return _output(values, depth, vectors, dtype if options.reduce else output), visible
+
+    total = points.shape[1]
+    return _over_pieces(piece, total, options, source.shape[1], output) if options.reduce else piece(0, total)
+
+
+def sample_views(
+    source: Tensor, pixels: Tensor, depth: Tensor, valid: Tensor, options: Options
+) -> tuple[Tensor, Tensor]:
+    """Sample images (B, V, C, h, w) at pixels (B, V, N, 2) of given depth (B, V, N), where valid.
+
+    Returns:
+        (B, V, C', N), or (B, C'', N) where options.reduce is set, and visibility (B, V, N).
+    """
+    dtype, output = _computing_dtype(source), source.dtype
+    source = source.to(dtype)
+
+    def piece(start: int, stop: int) -> tuple[Tensor, Tensor]:
+        part = slice(start, stop)
+        distance, domain = depth[..., part].to(dtype), valid[..., part]
+        front = domain & (distance > options.near)
+        index = [torch.where(front, axis, OUTSIDE) for axis in pixels[:, :, part].to(dtype).unbind(-1)]
+        values, visible = _sample(source, index, front, options)
+        distance = torch.where(domain, distance, 0.0)
+        return _output(values, distance if options.depth else None, None, dtype if options.reduce else output), visible
+
+    total = pixels.shape[2]
+    return _over_pieces(piece, total, options, source.shape[1], output) if options.reduce else piece(0, total)
+
+
+def _sweep(source: Tensor, sites: Sites, options: Options, output: torch.dtype) -> tuple[Tensor, Tensor]:
+    dtype = source.dtype
+    m = sites.matrix.to(dtype)
+    depth = (1.0 / _per_view(sites.z, sites.matrix)).to(dtype)  # (B, V, P)
+    front = depth > options.near
+    if sites.view_mask is not None:
+        front = front & sites.view_mask[..., None]
+    # M q / s = depth (M_x x + M_y y + M_1) + M_z. Planes to leave out are sent outside along the line, at no cost.
+    plane = _plane_rows(m, sites).clamp(-LARGEST_COORDINATE, LARGEST_COORDINATE)
+    reach = torch.where(front, depth, 0.0)[..., None, None]
+    offset = torch.where(front[:, :, None], m[..., 2, None], OUTSIDE)[..., None, None]  # (B, V, 3, P, 1, 1)
+    index = [torch.addcmul(offset[:, :, row], plane[:, :, row, None], reach) for row in range(3)]
+    views = source[:, None].expand(source.shape[0], sites.matrix.shape[1], *source.shape[1:])
+    values, visible = _sample(views, index, front[..., None, None], options)
+    sizes = visible.shape[3:]
+    channel = _masked(depth, sites.view_mask)[..., None, None].expand(*depth.shape, *sizes) if options.depth else None
+    return _output(values, channel, _lattice_directions(sites, dtype) if options.direction else None, output), visible
+
+
+def plane_sweep_project(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
+    """Sample volumes (B, C, D, H, W) at the sites of the views' frustums.
+
+    Returns:
+        (B, V, C', P, h, w) and visibility (B, V, P, h, w).
+    """
+    return _sweep(source.to(_computing_dtype(source)), sites, options, source.dtype)
+
+
+def project_reduce(source: Tensor, sites: Sites, weight: Tensor, options: Options) -> tuple[Tensor, Tensor]:
+    """`plane_sweep_project` and a linear map of its stacked channels, a few planes at a time.
+
+    Args:
+        source: (B, C, D, H, W).
+        sites: the views' frustums, P planes.
+        weight: (O, C', P).
+        options: of the call.
+
+    Returns:
+        (B, V, O, h, w), and visibility (B, V, P, h, w).
+    """
+    dtype = _computing_dtype(source)
+    volume = source.to(dtype)
+    total = sites.z.shape[-1]
+    step = max(1, min(total // 8, 256 // max(1, weight.shape[1])))
+
+    def piece(start: int, stop: int) -> tuple[Tensor, Tensor]:
+        maps, visible = _sweep(volume, sites.slab(start, stop), options, dtype)
+        stacked = maps.flatten(2, 3).flatten(3, 4)  # (B, V, C' p, h w)
+        part = torch.matmul(weight[:, :, start:stop].flatten(1).to(dtype), stacked)
+        return part.to(dtype).unflatten(3, maps.shape[-2:]), visible
+
+    total_map, seen = None, []
+    for start in range(0, total, step):
+        stop = min(start + step, total)
+        if torch.is_grad_enabled() and not is_traced():
+            part, visible = checkpoint(piece, start, stop, use_reentrant=False, preserve_rng_state=False)
+        else:
+            part, visible = piece(start, stop)
+        total_map = part if total_map is None else total_map + part
+        seen.append(visible)
+    assert total_map is not None
+    return _cast(total_map, source.dtype), torch.cat(seen, 2)
+
+
+OPERATORS: dict[str, Callable[..., Any]] = {
+    "unproject": unproject,
+    "unproject_points": unproject_points,
+    "sample_views": sample_views,
+    "plane_sweep_project": plane_sweep_project,
+    "project_reduce": project_reduce,
+}

@@ -1,0 +1,232 @@
+"""`Unproject` and `PlaneSweepProject`: the operators as modules without state."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from lsmgeo import functional, kernels
+from lsmgeo._checks import check_size, describe
+from lsmgeo.errors import DTypeError, GridError, OptionError
+from lsmgeo.functional import Cameras, Grid, Names, Projected, Unprojected
+from lsmgeo.grids import FrustumGrid, VoxelGrid, check_depths
+from lsmgeo.kernels.request import Options
+
+__all__ = ["PlaneSweepProject", "Unproject"]
+
+
+class Unproject(nn.Module):
+    """Lift image features to the sites of a grid; see `lsmgeo.functional.unproject` for equation and conventions.
+
+    Args:
+        grid: `VoxelGrid` or `FrustumGrid`; None if every call brings its own. Not part of the ``state_dict``.
+        mode: "bilinear" or "nearest".
+        padding_mode: "zeros" or "border".
+        augment: "depth", "direction" or both: channels to append, depth first.
+        direction_frame: "world" or "camera".
+        reduce: None, or "mean", "variance", "max" or several: statistics over the views that see a site.
+        near: least depth of a visible site, world units.
+        backend: "auto", or the name of one.
+
+    Shape:
+        - features: (B, V, C, h, w); cameras: B*V, view fastest; view_mask: (B, V) bool.
+        - volume: (B, V, C', D, H, W), or (B, C'', D, H, W) with `reduce`; visible: (B, V, D, H, W) bool.
+
+    Raises:
+        OptionError, DTypeError: at construction for options; for the rest see `lsmgeo.functional.unproject`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import Unproject, VoxelGrid
+        >>> from lsmgeo.cameras import orbit
+        >>> unproject = Unproject(VoxelGrid(8), augment=("depth", "direction"))
+        >>> cameras = orbit(torch.tensor([[0.0, 120.0, 240.0]]), 20.0, 2.0, focal_length=100.0, height=48, width=64)
+        >>> volume, visible = unproject(torch.rand(1, 3, 5, 24, 32), cameras)
+        >>> tuple(volume.shape), tuple(visible.shape)
+        ((1, 3, 9, 8, 8, 8), (1, 3, 8, 8, 8))
+    """
+
+    def __init__(
+        self,
+        grid: Grid | None = None,
+        *,
+        mode: str = "bilinear",
+        padding_mode: str = "zeros",
+        augment: Names = (),
+        direction_frame: str = "world",
+        reduce: Names | None = None,
+        near: float = 1e-6,
+        backend: str = "auto",
+    ) -> None:
+        super().__init__()
+        if grid is not None and not isinstance(grid, VoxelGrid | FrustumGrid):
+            raise DTypeError(f"Unproject: grid must be a VoxelGrid or a FrustumGrid; got {describe(grid)}")
+        kernels.check_backend("Unproject", backend)
+        Options.checked(
+            "Unproject",
+            volume=False,
+            mode=mode,
+            padding_mode=padding_mode,
+            augment=augment,
+            direction_frame=direction_frame,
+            reduce=reduce,
+            near=near,
+        )
+        self.grid = grid
+        self.mode = mode
+        self.padding_mode = padding_mode
+        self.augment = augment
+        self.direction_frame = direction_frame
+        self.reduce = reduce
+        self.near = near
+        self.backend = backend
+
+    def forward(
+        self, features: Tensor, cameras: Cameras, view_mask: Tensor | None = None, *, grid: Grid | None = None
+    ) -> Unprojected:
+        """Unproject features (B, V, C, h, w); `grid` takes the place of the layer's."""
+        grid = self.grid if grid is None else grid
+        if grid is None:
+            raise GridError("Unproject: grid must be given to the layer or to the call; got None")
+        return functional.unproject(
+            features,
+            cameras,
+            grid,
+            view_mask=view_mask,
+            mode=self.mode,
+            padding_mode=self.padding_mode,
+            augment=self.augment,
+            direction_frame=self.direction_frame,
+            reduce=self.reduce,
+            near=self.near,
+            backend=self.backend,
+        )
+
+    def extra_repr(self) -> str:
+        """The arguments."""
+        return (
+            f"{self.grid}, mode={self.mode!r}, padding_mode={self.padding_mode!r}, augment={self.augment!r}, "
+            f"direction_frame={self.direction_frame!r}, reduce={self.reduce!r}, near={self.near!r}, "
+            f"backend={self.backend!r}"
+        )
+
+
+class PlaneSweepProject(nn.Module):
+    """Read a volume along the rays of cameras at planes of depth; see `lsmgeo.functional.plane_sweep_project`.
+
+    Args:
+        grid: the `VoxelGrid` on which the volumes live; None if every call brings its own.
+        depths: (P,), (B, P) or (B, V, P), see `lsmgeo.depth_planes`; None if every call brings its own. Neither is part
+            of the ``state_dict``; both follow the volume's device.
+        size: (h, w) of the maps; by default the cameras' image size.
+        mode: "trilinear" or "nearest".
+        padding_mode: "zeros" or "border".
+        augment: "depth", "direction" or both.
+        direction_frame: "world" or "camera".
+        flatten: whether channels and planes share an axis, index ``c * P + k``.
+        near: least depth of a visible plane, world units.
+        backend: "auto", or the name of one.
+
+    Shape:
+        - volume: (B, C, D, H, W); cameras: B*V, view fastest; view_mask: (B, V) bool.
+        - maps: (B, V, C' P, h, w), or (B, V, C', P, h, w) where `flatten` is False; visible: (B, V, P, h, w) bool.
+
+    Raises:
+        OptionError, DTypeError, GridError: at construction; for the rest see `lsmgeo.functional.plane_sweep_project`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import PlaneSweepProject, VoxelGrid, depth_planes
+        >>> from lsmgeo.cameras import orbit
+        >>> project = PlaneSweepProject(VoxelGrid(8), depth_planes(1.0, 3.0, 6), size=(12, 16), mode="nearest")
+        >>> cameras = orbit(torch.tensor([[0.0, 120.0, 240.0]]), 20.0, 2.0, focal_length=100.0, height=48, width=64)
+        >>> maps, visible = project(torch.rand(1, 5, 8, 8, 8), cameras)
+        >>> tuple(maps.shape), tuple(visible.shape)
+        ((1, 3, 30, 12, 16), (1, 3, 6, 12, 16))
+    """
+
+    def __init__(
+        self,
+        grid: VoxelGrid | None = None,
+        depths: Tensor | None = None,
+        size: tuple[int, int] | None = None,
+        *,
+        mode: str = "trilinear",
+        padding_mode: str = "zeros",
+        augment: Names = (),
+        direction_frame: str = "world",
+        flatten: bool = True,
+        near: float = 1e-6,
+        backend: str = "auto",
+    ) -> None:
+        super().__init__()
+        who = "PlaneSweepProject"
+        if grid is not None and not isinstance(grid, VoxelGrid):
+            raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
+        if depths is not None:
+            check_depths(who, depths, "(P,), (B, P) or (B, V, P)")
+        if size is not None:
+            check_size(who, "size", size, 2, "(h, w)")
+        if not isinstance(flatten, bool):
+            raise OptionError(f"{who}: flatten must be True or False; got {describe(flatten)}")
+        kernels.check_backend(who, backend)
+        Options.checked(
+            who,
+            volume=True,
+            mode=mode,
+            padding_mode=padding_mode,
+            augment=augment,
+            direction_frame=direction_frame,
+            near=near,
+        )
+        self.grid = grid
+        self.depths = depths
+        self.size = size
+        self.mode = mode
+        self.padding_mode = padding_mode
+        self.augment = augment
+        self.direction_frame = direction_frame
+        self.flatten = flatten
+        self.near = near
+        self.backend = backend
+
+    def forward(
+        self,
+        volume: Tensor,
+        cameras: Cameras,
+        view_mask: Tensor | None = None,
+        *,
+        grid: VoxelGrid | None = None,
+        depths: Tensor | None = None,
+    ) -> Projected:
+        """Sweep a volume (B, C, D, H, W); `grid` and `depths` take the place of the layer's."""
+        grid = self.grid if grid is None else grid
+        if grid is None:
+            raise GridError("PlaneSweepProject: grid must be given to the layer or to the call; got None")
+        if depths is None and self.depths is not None:
+            depths = self.depths.to(volume.device) if isinstance(volume, Tensor) else self.depths
+        if depths is None:
+            raise GridError("PlaneSweepProject: depths must be given to the layer or to the call; got None")
+        return functional.plane_sweep_project(
+            volume,
+            cameras,
+            grid,
+            depths,
+            self.size,
+            view_mask=view_mask,
+            mode=self.mode,
+            padding_mode=self.padding_mode,
+            augment=self.augment,
+            direction_frame=self.direction_frame,
+            flatten=self.flatten,
+            near=self.near,
+            backend=self.backend,
+        )
+
+    def extra_repr(self) -> str:
+        """The arguments."""
+        depths = None if self.depths is None else f"<{tuple(self.depths.shape)} {self.depths.dtype}>"
+        return (
+            f"{self.grid}, depths={depths}, size={self.size}, mode={self.mode!r}, padding_mode={self.padding_mode!r}, "
+            f"augment={self.augment!r}, direction_frame={self.direction_frame!r}, flatten={self.flatten}, "
+            f"near={self.near!r}, backend={self.backend!r}"
+        )

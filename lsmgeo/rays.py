@@ -1,0 +1,378 @@
+"""Reductions of a swept volume along its rays: what turns planes into maps.
+
+A swept volume is (..., P, h, w) or (..., C, P, h, w) with the planes in ascending depth, as
+``plane_sweep_project(..., flatten=False)`` gives it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lsmgeo import kernels
+from lsmgeo._checks import check_devices, check_float, describe
+from lsmgeo.errors import DTypeError, OptionError, ShapeError
+from lsmgeo.functional import Cameras, Names, Projected, sweep_sites
+from lsmgeo.grids import VoxelGrid, check_depths
+from lsmgeo.kernels.request import Options
+
+__all__ = ["Composited", "ProjectReduce", "composite", "expected_depth", "max_along_rays", "project_reduce"]
+
+
+def _check_planes(who: str, name: str, planes: Tensor) -> None:
+    check_float(who, name, planes, "(..., P, h, w)")
+    if planes.dim() < 3 or planes.shape[-3] < 1:
+        raise ShapeError(f"{who}: {name} must be (..., P, h, w) with P at least 1; got {tuple(planes.shape)}")
+
+
+def _check_visible(who: str, visible: Tensor | None, planes: Tensor) -> None:
+    if visible is None:
+        return
+    if not isinstance(visible, Tensor) or visible.dtype != torch.bool:
+        raise DTypeError(
+            f"{who}: visible must be a bool tensor that broadcasts to {tuple(planes.shape)}; got {describe(visible)}"
+        )
+    try:
+        torch.broadcast_shapes(visible.shape, planes.shape)
+    except RuntimeError:
+        raise ShapeError(
+            f"{who}: visible must broadcast to {tuple(planes.shape)}; got {tuple(visible.shape)}"
+        ) from None
+    check_devices(who, planes=planes, visible=visible)
+
+
+def _along_rays(who: str, depths: Tensor, planes: Tensor) -> Tensor:
+    """Depths (P,) or (..., P) as (..., P, 1, 1) against planes (..., P, h, w)."""
+    check_float(who, "depths", depths, "(P,) or (..., P)")
+    if depths.dim() < 1 or depths.shape[-1] != planes.shape[-3]:
+        raise ShapeError(f"{who}: depths must be (..., P) with P = {planes.shape[-3]}; got {tuple(depths.shape)}")
+    check_devices(who, planes=planes, depths=depths)
+    return depths.to(planes.dtype)[..., None, None]
+
+
+def expected_depth(scores: Tensor, depths: Tensor, visible: Tensor | None = None) -> Tensor:
+    """Mean depth under the softmax of scores along each ray (soft-argmax).
+
+    Equation: ``sum_k softmax(scores)_k depth_k`` (Kendall et al., "End-to-End Learning of Geometry and Context for Deep
+    Stereo Regression", 2017, section 3.4).
+
+    Args:
+        scores: (..., P, h, w); larger means likelier.
+        depths: (P,) or (..., P), world units.
+        visible: bool, broadcasts to the scores; samples where it is False have no weight.
+
+    Returns:
+        (..., h, w) depths; 0 on rays with no visible sample. Differentiable in scores and depths.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import rays
+        >>> scores = torch.tensor([0.0, 0.0, 0.0]).reshape(3, 1, 1)
+        >>> rays.expected_depth(scores, torch.tensor([1.0, 2.0, 4.5]))
+        tensor([[2.5000]])
+    """
+    who = "expected_depth"
+    _check_planes(who, "scores", scores)
+    _check_visible(who, visible, scores)
+    planes = _along_rays(who, depths, scores)
+    if visible is None:
+        return (scores.softmax(-3) * planes).sum(-3)
+    seen = visible.expand(torch.broadcast_shapes(visible.shape, scores.shape))
+    any_seen = seen.any(-3, keepdim=True)
+    # Rays with no sample get even weights, which are then dropped: a softmax over nothing is NaN.
+    weights = torch.where(seen | ~any_seen, scores, -torch.inf).softmax(-3)
+    return torch.where(any_seen.squeeze(-3), (weights * planes).sum(-3), 0.0)
+
+
+def max_along_rays(maps: Tensor, visible: Tensor | None = None) -> Tensor:
+    """Largest value along each ray, as in maximum intensity projection.
+
+    Args:
+        maps: (..., P, h, w), channels before the planes if there are any.
+        visible: bool, broadcasts to the maps (put an axis of 1 in the place of channels).
+
+    Returns:
+        (..., h, w); 0 on rays with no visible sample. The gradient goes to the first plane that attains it.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import rays
+        >>> rays.max_along_rays(torch.tensor([1.0, 3.0, 2.0]).reshape(3, 1, 1))
+        tensor([[3.]])
+    """
+    who = "max_along_rays"
+    _check_planes(who, "maps", maps)
+    _check_visible(who, visible, maps)
+    if visible is None:
+        first = maps.detach().max(-3, keepdim=True).indices
+        return maps.gather(-3, first).squeeze(-3)
+    seen = visible.expand(maps.shape)
+    first = torch.where(seen, maps.detach(), -torch.inf).max(-3, keepdim=True).indices
+    return torch.where(seen.any(-3), maps.gather(-3, first).squeeze(-3), 0.0)
+
+
+class Composited(NamedTuple):
+    """Values and depth seen along rays, what is left of the light behind, and the weight of each sample."""
+
+    values: Tensor
+    depth: Tensor
+    transmittance: Tensor
+    weights: Tensor
+
+
+def composite(alpha: Tensor, values: Tensor, depths: Tensor, visible: Tensor | None = None) -> Composited:
+    """Front-to-back compositing of planes along each ray.
+
+    Equation: ``w_k = alpha_k prod_{j<k} (1 - alpha_j)``, ``values = sum_k w_k values_k`` (Porter and Duff, "Compositing
+    Digital Images", 1984).
+
+    Args:
+        alpha: (..., P, h, w) opacities in [0, 1].
+        values: (..., C, P, h, w).
+        depths: (P,) or (..., P), world units.
+        visible: bool, broadcasts to alpha; samples where it is False are transparent.
+
+    Returns:
+        `Composited`: values (..., C, h, w), depth (..., h, w) as ``sum_k w_k depth_k`` (divide by ``1 - transmittance``
+        for the mean), transmittance (..., h, w) and weights (..., P, h, w). Differentiable in all arguments.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import rays
+        >>> alpha = torch.tensor([0.5, 1.0]).reshape(2, 1, 1)
+        >>> seen = rays.composite(alpha, torch.tensor([8.0, 2.0]).reshape(1, 2, 1, 1), torch.tensor([1.0, 3.0]))
+        >>> seen.values, seen.depth, seen.transmittance
+        (tensor([[[5.]]]), tensor([[2.]]), tensor([[0.]]))
+    """
+    who = "composite"
+    _check_planes(who, "alpha", alpha)
+    _check_planes(who, "values", values)
+    if values.shape[:-4] + values.shape[-3:] != alpha.shape:
+        raise ShapeError(
+            f"{who}: values must be (..., C, P, h, w) with alpha's {tuple(alpha.shape)}; got {tuple(values.shape)}"
+        )
+    if values.dtype != alpha.dtype:
+        raise DTypeError(f"{who}: values must be of alpha's {alpha.dtype}; got {values.dtype}")
+    _check_visible(who, visible, alpha)
+    planes = _along_rays(who, depths, alpha)
+    if visible is not None:
+        alpha = torch.where(visible, alpha, 0.0)
+    through = (1.0 - alpha).cumprod(-3)
+    before = torch.cat((torch.ones_like(through[..., :1, :, :]), through[..., :-1, :, :]), -3)
+    weights = alpha * before
+    return Composited(
+        (weights[..., None, :, :, :] * values).sum(-3), (weights * planes).sum(-3), through[..., -1, :, :], weights
+    )
+
+
+def project_reduce(
+    volume: Tensor,
+    cameras: Cameras,
+    grid: VoxelGrid,
+    depths: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    size: tuple[int, int] | None = None,
+    *,
+    view_mask: Tensor | None = None,
+    mode: str = "trilinear",
+    padding_mode: str = "zeros",
+    augment: Names = (),
+    direction_frame: str = "world",
+    near: float = 1e-6,
+    backend: str = "auto",
+) -> Projected:
+    """Sweep a volume and map the C' P stacked channels linearly to O, without ever holding them.
+
+    Equation: ``conv2d(plane_sweep_project(volume, ...).maps, weight, bias)`` with a 1x1 kernel, summed over the planes
+    (the learned ray pooling of Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017).
+
+    Args:
+        volume: (B, C, D, H, W).
+        cameras: B*V cameras, view fastest.
+        grid: the volume's `VoxelGrid`.
+        depths: (P,), (B, P) or (B, V, P).
+        weight: (O, C' P), or (O, C' P, 1, 1) as ``torch.nn.Conv2d`` has it; input channel ``c * P + k``.
+        bias: (O,) or None.
+        size: (h, w) of the maps.
+        view_mask: as in `lsmgeo.functional.plane_sweep_project`, like all further options; maps of masked views hold
+            the bias.
+        mode: see there.
+        padding_mode: see there.
+        augment: see there.
+        direction_frame: see there.
+        near: see there.
+        backend: see there.
+
+    Returns:
+        ``maps`` (B, V, O, h, w) and ``visible`` (B, V, P, h, w). Differentiable in everything real.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, CameraError, GridError, OptionError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import VoxelGrid, depth_planes, rays
+        >>> from lsmgeo.cameras import orbit
+        >>> camera = orbit(torch.tensor([[0.0]]), 0.0, 2.0, focal_length=8.0, height=3, width=3)
+        >>> planes = depth_planes(1.75, 2.25, 3)
+        >>> maps, _ = rays.project_reduce(torch.ones(1, 1, 4, 4, 4), camera, VoxelGrid(4), planes, torch.ones(2, 3))
+        >>> maps[0, 0, :, 1, 1]
+        tensor([3., 3.])
+    """
+    who = "project_reduce"
+    options = Options.checked(
+        who,
+        volume=True,
+        mode=mode,
+        padding_mode=padding_mode,
+        augment=augment,
+        direction_frame=direction_frame,
+        near=near,
+    )
+    kernels.check_backend(who, backend)
+    sites = sweep_sites(who, volume, cameras, grid, depths, size, view_mask, options)
+    check_float(who, "weight", weight, "(O, C' P)")
+    if weight.dim() == 4 and tuple(weight.shape[2:]) == (1, 1):
+        weight = weight.flatten(1)
+    planes = depths.shape[-1]
+    channels = volume.shape[1] + bool(options.depth) + 3 * bool(options.direction)
+    if weight.dim() != 2 or weight.shape[1] != channels * planes:
+        raise ShapeError(
+            f"{who}: weight must be (O, C' P) or (O, C' P, 1, 1) with C' P = {channels} * {planes}; "
+            f"got {tuple(weight.shape)}"
+        )
+    check_devices(who, volume=volume, weight=weight, bias=bias)
+    if bias is not None:
+        check_float(who, "bias", bias, "(O,)")
+        if tuple(bias.shape) != (weight.shape[0],):
+            raise ShapeError(f"{who}: bias must be (O,) = ({weight.shape[0]},); got {tuple(bias.shape)}")
+    stacked = weight.unflatten(1, (channels, planes))
+    maps, visible = kernels.run("project_reduce", volume, sites, stacked, options=options, backend=backend)
+    if bias is not None:
+        maps = maps + bias.to(maps.dtype)[:, None, None]
+    return Projected(maps, visible)
+
+
+class ProjectReduce(nn.Module):
+    """`project_reduce` with learned weights: a plane sweep and a 1x1 convolution over its C' P channels in one.
+
+    Args:
+        in_channels: C of the volumes.
+        out_channels: O.
+        grid: the `VoxelGrid` on which the volumes live.
+        depths: (P,), (B, P) or (B, V, P).
+        size: (h, w) of the maps; by default the cameras' image size.
+        bias: whether to add a learned bias.
+        mode: as in `lsmgeo.PlaneSweepProject`, like all further options.
+        padding_mode: see there.
+        augment: see there.
+        direction_frame: see there.
+        near: see there.
+        backend: see there.
+
+    Shape:
+        - volume: (B, C, D, H, W); cameras: B*V, view fastest; view_mask: (B, V) bool.
+        - maps: (B, V, O, h, w); visible: (B, V, P, h, w) bool.
+
+    ``weight`` (O, C' P, 1, 1) and ``bias`` (O,) are named, shaped and initialised as those of ``torch.nn.Conv2d``.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import VoxelGrid, depth_planes
+        >>> from lsmgeo.cameras import orbit
+        >>> from lsmgeo.rays import ProjectReduce
+        >>> reduce = ProjectReduce(5, 7, VoxelGrid(8), depth_planes(1.0, 3.0, 6), size=(12, 16))
+        >>> cameras = orbit(torch.tensor([[0.0, 120.0]]), 20.0, 2.0, focal_length=100.0, height=48, width=64)
+        >>> maps, visible = reduce(torch.rand(1, 5, 8, 8, 8), cameras)
+        >>> tuple(maps.shape)
+        (1, 2, 7, 12, 16)
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        grid: VoxelGrid,
+        depths: Tensor,
+        size: tuple[int, int] | None = None,
+        *,
+        bias: bool = True,
+        mode: str = "trilinear",
+        padding_mode: str = "zeros",
+        augment: Names = (),
+        direction_frame: str = "world",
+        near: float = 1e-6,
+        backend: str = "auto",
+    ) -> None:
+        super().__init__()
+        who = "ProjectReduce"
+        options = Options.checked(
+            who,
+            volume=True,
+            mode=mode,
+            padding_mode=padding_mode,
+            augment=augment,
+            direction_frame=direction_frame,
+            near=near,
+        )
+        kernels.check_backend(who, backend)
+        for name, value in (("in_channels", in_channels), ("out_channels", out_channels)):
+            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+                raise OptionError(f"{who}: {name} must be an integer, at least 1; got {describe(value)}")
+        if not isinstance(grid, VoxelGrid):
+            raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
+        check_depths(who, depths, "(P,), (B, P) or (B, V, P)")
+        self.grid = grid
+        self.depths = depths
+        self.size = size
+        self.mode = mode
+        self.padding_mode = padding_mode
+        self.augment = augment
+        self.direction_frame = direction_frame
+        self.near = near
+        self.backend = backend
+        channels = in_channels + bool(options.depth) + 3 * bool(options.direction)
+        convolution = nn.Conv2d(channels * depths.shape[-1], out_channels, 1, bias=bias)
+        self.weight = convolution.weight
+        self.bias = convolution.bias
+
+    def forward(self, volume: Tensor, cameras: Cameras, view_mask: Tensor | None = None) -> Projected:
+        """Sweep and reduce a volume (B, C, D, H, W)."""
+        depths = self.depths.to(volume.device) if isinstance(volume, Tensor) else self.depths
+        return project_reduce(
+            volume,
+            cameras,
+            self.grid,
+            depths,
+            self.weight,
+            self.bias,
+            self.size,
+            view_mask=view_mask,
+            mode=self.mode,
+            padding_mode=self.padding_mode,
+            augment=self.augment,
+            direction_frame=self.direction_frame,
+            near=self.near,
+            backend=self.backend,
+        )
+
+    def extra_repr(self) -> str:
+        """The arguments."""
+        return (
+            f"{self.weight.shape[1] // self.depths.shape[-1]} channels x {self.depths.shape[-1]} planes -> "
+            f"{self.weight.shape[0]}, {self.grid}, size={self.size}, mode={self.mode!r}, "
+            f"padding_mode={self.padding_mode!r}, augment={self.augment!r}, direction_frame={self.direction_frame!r}, "
+            f"near={self.near!r}, backend={self.backend!r}"
+        )

@@ -1,8 +1,8 @@
 """Lattices of sites in the world: voxel grids, camera frustums, depth planes.
 
 A lattice is a regular array of sites with homogeneous index ``q = (x[i], y[j], z[k], 1)`` and homogeneous world
-position ``X ~ T q``. `VoxelGrid` counts x, y, z = 0, 1, 2, ... with T affine; `FrustumGrid` has ``z[k] = 1 / depth[k]`` and T
-projective. Nothing else distinguishes them.
+position ``X ~ T q``. `VoxelGrid` counts x, y, z = 0, 1, 2, ... with T affine; `FrustumGrid` has ``z[k] = 1 / depth[k]``
+and T projective. Nothing else distinguishes them.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class VoxelGrid:
         return Lattice(T, x, y, z, False)
 
     def centers(self) -> Tensor:
-        """Voxel centres in the world as x, y, z, (D, H, W, 3) or (B, D, H, W, 3), of `world_from_grid`'s dtype if any."""
+        """Voxel centres in the world, (D, H, W, 3) or (B, D, H, W, 3) as x, y, z, of `world_from_grid`'s dtype."""
         dtype = torch.get_default_dtype() if self.world_from_grid is None else self.world_from_grid.dtype
         return self.lattice().centers().to(dtype)
 
@@ -281,7 +281,7 @@ def depth_planes(near: float | Tensor, far: float | Tensor, num: int, spacing: s
     """Depths of sweep planes from near to far, both ends included.
 
     Equation: with a in [0, 1] evenly spaced, "depth": near + a (far - near); "inverse":
-    1 / (1/near + a (1/far - 1/near)); "log": near (far / near)^a. "inverse" moves a sample by even steps in a second view.
+    1 / (1/near + a (1/far - 1/near)); "log": near (far / near)^a. "inverse" moves a sample by even steps in another view.
 
     Args:
         near: first depth, positive, world units; a number, or (B,) for depths of each scene.

@@ -6,8 +6,9 @@ from torch import Tensor, nn
 
 from lsmgeo import functional, kernels
 from lsmgeo._checks import check_size, describe
+from lsmgeo._sites import Cameras, Grid
 from lsmgeo.errors import DTypeError, GridError, OptionError
-from lsmgeo.functional import Cameras, Grid, Names, Projected, Unprojected
+from lsmgeo.functional import Names, Projected, Unprojected
 from lsmgeo.grids import FrustumGrid, VoxelGrid, check_depths
 from lsmgeo.kernels.request import Options
 

@@ -13,8 +13,9 @@ from torch import Tensor, nn
 
 from lsmgeo import kernels
 from lsmgeo._checks import check_devices, check_float, describe
+from lsmgeo._sites import Cameras, sweep_sites
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
-from lsmgeo.functional import Cameras, Names, Projected, sweep_sites
+from lsmgeo.functional import Names, Projected
 from lsmgeo.grids import VoxelGrid, check_depths
 from lsmgeo.kernels.request import Options
 

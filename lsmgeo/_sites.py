@@ -1,0 +1,168 @@
+"""From cameras and grids to the sites that a kernel visits: every check of the operators' tensors, and two products.
+
+The matrices are composed in float64. Nothing below this module knows cameras or grids, nothing above composes matrices.
+"""
+
+from __future__ import annotations
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from lsmgeo._checks import check_devices, check_float, check_mask, check_size, describe
+from lsmgeo._linalg import affine_inverse, multiply
+from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
+from lsmgeo.cameras.tensors import CameraTensors, as_tensors, check_cameras, image_sizes
+from lsmgeo.cameras.transforms import common_size
+from lsmgeo.errors import DTypeError, ShapeError
+from lsmgeo.grids import FrustumGrid, Lattice, VoxelGrid, check_depths
+from lsmgeo.kernels.request import Options, Sites
+
+__all__ = ["check_features", "direction_matrix", "image_matrices", "image_sites", "sweep_sites"]
+
+Cameras = PinholeCamera | CameraTensors
+Grid = VoxelGrid | FrustumGrid
+
+
+def check_features(who: str, features: Tensor, count: int | None = None) -> tuple[int, int]:
+    """Require (B, V, C, h, w), with B*V = `count` if given; return (B, V)."""
+    expected = "(B, V, C, h, w)" if count is None else f"(B, V, C, h, w) with B*V = {count} cameras"
+    check_float(who, "features", features, expected)
+    if features.dim() != 5:
+        raise ShapeError(f"{who}: features must be {expected}; got {tuple(features.shape)}")
+    B, V, _, h, w = features.shape
+    if V < 1 or h < 1 or w < 1:
+        raise ShapeError(f"{who}: features must be {expected}, V, h and w at least 1; got {tuple(features.shape)}")
+    if count is not None and B * V != count:
+        raise ShapeError(f"{who}: features must be {expected}; got {tuple(features.shape)}, that is {B * V}")
+    return B, V
+
+
+def _camera_count(cameras: CameraTensors) -> int:
+    count = 1
+    for size in cameras.cam_from_world.shape[:-2]:
+        count *= size
+    return count
+
+
+def _views(
+    who: str, cameras: CameraTensors, views: tuple[int, int], view_mask: Tensor | None, **tensors: Tensor
+) -> CameraTensors:
+    """Bring cameras to leading shape (B, V) and check them."""
+    leading = tuple(cameras.cam_from_world.shape[:-2])
+    if leading != views and leading != (views[0] * views[1],):
+        raise ShapeError(
+            f"{who}: cameras must have leading shape (B, V) = {views}, or (B*V,) with the view fastest; got {leading}"
+        )
+    if view_mask is not None:
+        check_mask(who, "view_mask", view_mask, views, "(B, V)")
+    check_devices(who, **tensors, cameras=cameras.intrinsics, view_mask=view_mask)
+    if leading != views:
+        height, width = (size.reshape(views) for size in image_sizes(cameras))
+        K, E = cameras.intrinsics.reshape(*views, 3, 3), cameras.cam_from_world.reshape(*views, 4, 4)
+        cameras = CameraTensors(K, E, height, width)
+    check_cameras(who, cameras, view_mask)
+    return cameras
+
+
+def image_matrices(who: str, features: Tensor, cameras: Cameras, view_mask: Tensor | None) -> CameraMatrices:
+    """The cameras (B, V) of a feature map, checked, K resized to it."""
+    tensors = as_tensors(cameras, who)
+    views = check_features(who, features, _camera_count(tensors))
+    tensors = _views(who, tensors, views, view_mask, features=features)
+    return camera_matrices(tensors, (features.shape[3], features.shape[4]), view_mask)
+
+
+def _lattice(who: str, grid: Grid, source: Tensor) -> Lattice:
+    if not isinstance(grid, VoxelGrid | FrustumGrid):
+        raise DTypeError(f"{who}: grid must be a VoxelGrid or a FrustumGrid; got {describe(grid)}")
+    lattice = grid.lattice()
+    if not isinstance(source, Tensor):
+        return lattice
+    for tensor in (lattice.world_from_lattice, lattice.z):
+        if tensor.dim() > 1 + (tensor is lattice.world_from_lattice) and tensor.shape[0] != source.shape[0]:
+            raise ShapeError(
+                f"{who}: grid must be of one scene or of B = {source.shape[0]}; got {tensor.shape[0]} scenes"
+            )
+    return lattice.to(source.device)
+
+
+def direction_matrix(matrices: CameraMatrices, T: Tensor, frame: str) -> Tensor:
+    """G, (B, V, 3, 4), whose ``G q`` points from the camera centre to the site."""
+    if frame == "camera":
+        extrinsics = torch.cat((matrices.rotation, matrices.translation[..., None]), -1)
+        return multiply(extrinsics, T)
+    return T[..., :3, :] - matrices.center[..., None] * T[..., 3:, :]
+
+
+def image_sites(
+    who: str,
+    features: Tensor,
+    cameras: Cameras,
+    grid: Grid,
+    view_mask: Tensor | None,
+    options: Options,
+) -> Sites:
+    """The sites of a grid as the views' images see them, everything checked."""
+    lattice = _lattice(who, grid, features)
+    matrices = image_matrices(who, features, cameras, view_mask)
+    T, x, y, z, projective = lattice
+    T = T if T.dim() == 2 else T[:, None]  # (B, 1, 4, 4): shared by the views
+    direction = direction_matrix(matrices, T, options.direction) if options.direction else None
+    return Sites(multiply(matrices.projection, T), direction, x, y, z, projective, view_mask)
+
+
+def sweep_sites(
+    who: str,
+    volume: Tensor,
+    cameras: Cameras,
+    grid: VoxelGrid,
+    depths: Tensor,
+    size: tuple[int, int] | None,
+    view_mask: Tensor | None,
+    options: Options,
+) -> Sites:
+    """The sites of the views' frustums as a volume sees them, everything checked."""
+    check_float(who, "volume", volume, "(B, C, D, H, W)", rank=5)
+    if not isinstance(grid, VoxelGrid):
+        raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
+    if tuple(volume.shape[2:]) != grid.shape:
+        raise ShapeError(
+            f"{who}: volume must be (B, C, D, H, W) with the grid's (D, H, W) = {grid.shape}; got {tuple(volume.shape)}"
+        )
+    tensors = as_tensors(cameras, who)
+    count, scenes = _camera_count(tensors), volume.shape[0]
+    leading = tensors.cam_from_world.shape[:-2]
+    if len(leading) == 2:
+        views = (leading[0], leading[1])
+        if leading[0] != scenes:
+            raise ShapeError(f"{who}: cameras must be (B, V) with the volume's B = {scenes}; got {tuple(leading)}")
+    else:
+        # With no scene the number of views cannot be told, and 1 is as good as any.
+        if scenes == 0 and count == 0:
+            views = (0, 1)
+        elif scenes == 0 or count % scenes:
+            raise ShapeError(f"{who}: cameras must be B*V with the volume's B = {scenes}; got {count}")
+        else:
+            views = (scenes, count // scenes)
+    if views[1] < 1:
+        raise ShapeError(f"{who}: cameras must hold at least one view a scene; got none")
+    lattice = _lattice(who, grid, volume)
+    tensors = _views(who, tensors, views, view_mask, volume=volume)
+    check_depths(who, depths, "(P,), (B, P) or (B, V, P)", view_mask)
+    if depths.dim() > 1 and tuple(depths.shape[:-1]) != views[: depths.dim() - 1]:
+        raise ShapeError(
+            f"{who}: depths must be (P,), (B, P) or (B, V, P) with (B, V) = {views}; got {tuple(depths.shape)}"
+        )
+    check_devices(who, volume=volume, depths=depths)
+    size = common_size(who, tensors) if size is None else check_size(who, "size", size, 2, "(h, w)")  # type: ignore[assignment]
+    assert size is not None
+    matrices = camera_matrices(tensors, size, view_mask)
+    frustum = matrices.world_from_frustum
+    inverse = affine_inverse(lattice.world_from_lattice)[..., :3, :]
+    matrix = multiply(inverse if inverse.dim() == 2 else inverse[:, None], frustum)
+    direction = direction_matrix(matrices, frustum, options.direction) if options.direction else None
+    x, y = (torch.arange(n, dtype=torch.float64, device=volume.device) for n in (size[1], size[0]))
+    if view_mask is not None and depths.dim() == 3:
+        depths = torch.where(view_mask[..., None], depths, 1.0)
+    return Sites(matrix, direction, x, y, 1.0 / depths.double(), True, view_mask)

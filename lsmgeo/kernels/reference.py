@@ -138,24 +138,21 @@ def _aligned(per_view: Tensor, dim: int) -> Tensor:
 # Sampling
 
 
-def _coordinate(index: Tensor, size: int, options: Options, differentiable: bool) -> Tensor:
+def _coordinate(index: Tensor, size: int, options: Options) -> Tensor:
     """From an array index to `grid_sample`'s coordinate, ``(2 u + 1) / n - 1`` for ``align_corners=False``."""
     if options.mode == "nearest":
         # The cell that contains the sample; grid_sample would round half to even.
         index = torch.floor(index.detach() + 0.5)
-        differentiable = False
     if options.padding_mode == "border":
         # No gradient at and beyond the outermost centres.
         index = torch.where((index > 0) & (index < size - 1), index, index.detach().clamp(0, size - 1))
     else:
         index = index.clamp(OUTSIDE, size + 1)  # all taps are outside there too; infinity would give NaN
     coordinate = torch.add(index.new_tensor(1.0 / size - 1.0), index, alpha=2.0 / size)
-    if differentiable:
-        # grid_sample undoes this with rounding errors of a few ulp. An index that is an integer must not fall into the
-        # cell below: its derivative is that of the cell above.
-        whole = index.detach()
-        coordinate = torch.add(coordinate, whole == whole.floor(), alpha=4.0 * torch.finfo(index.dtype).eps)
-    return coordinate
+    # grid_sample undoes this with rounding errors of a few ulp. An index that is an integer must not fall into the cell
+    # below, which it does not read and whose derivative it does not have.
+    whole = index.detach()
+    return torch.add(coordinate, whole == whole.floor(), alpha=4.0 * torch.finfo(index.dtype).eps)
 
 
 def _sample(source: Tensor, index: Sequence[Tensor], front: Tensor, options: Options) -> tuple[Tensor, Tensor]:
@@ -173,10 +170,7 @@ def _sample(source: Tensor, index: Sequence[Tensor], front: Tensor, options: Opt
     sizes = tuple(reversed(source.shape[3:]))  # x, y(, z)
     inside = [(axis >= -0.5) & (axis < size - 0.5) for axis, size in zip(index, sizes, strict=True)]
     visible = reduce(torch.logical_and, inside)
-    differentiable = is_traced() or any(axis.requires_grad for axis in index)
-    grid = torch.stack(
-        [_coordinate(axis, size, options, differentiable) for axis, size in zip(index, sizes, strict=True)], -1
-    )
+    grid = torch.stack([_coordinate(axis, size, options) for axis, size in zip(index, sizes, strict=True)], -1)
     grid = grid.flatten(0, 1)
     if len(sizes) == 2:  # grid_sample wants as many axes of sites as the source has
         grid = grid.flatten(1, -3) if grid.dim() > 3 else grid[:, None]

@@ -152,7 +152,8 @@ def _coordinate(index: Tensor, size: int, options: Options) -> Tensor:
     # grid_sample undoes this with rounding errors of a few ulp. An index that is an integer must not fall into the cell
     # below, which it does not read and whose derivative it does not have.
     whole = index.detach()
-    return torch.add(coordinate, whole == whole.floor(), alpha=4.0 * torch.finfo(index.dtype).eps)
+    on_center = (whole == whole.floor()).to(coordinate.dtype)
+    return torch.add(coordinate, on_center, alpha=4.0 * torch.finfo(index.dtype).eps)
 
 
 def _sample(source: Tensor, index: Sequence[Tensor], front: Tensor, options: Options) -> tuple[Tensor, Tensor]:

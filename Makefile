@@ -26,7 +26,7 @@ help: ## this list
 # $(1): bin folder of the environment, $(2): what to install
 define install
 	@if UV=$$(command -v uv) || { $(1)/python -m pip install --quiet uv 2>/dev/null && UV=$(1)/uv; }; then \
-		"$$UV" pip install --quiet --python $(1)/python $(2) && exit 0; \
+		"$$UV" pip install --quiet --compile-bytecode --python $(1)/python $(2) && exit 0; \
 		echo 'uv could not install; trying pip' >&2; \
 	fi; \
 	$(1)/python -m pip install --quiet $(2)

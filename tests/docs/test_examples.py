@@ -1,0 +1,44 @@
+"""The examples run as they stand, and their numbers are what their pages say."""
+
+import runpy
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+
+@pytest.fixture
+def run(monkeypatch):
+    """Run one example by its name and return its variables."""
+    plt.switch_backend("Agg")
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    monkeypatch.setattr(plt, "show", lambda: None)
+    yield lambda name: runpy.run_path(str(EXAMPLES / f"plot_{name}.py"))
+    plt.close("all")
+
+
+def test_one_view_gives_the_surface_its_paint(run):
+    assert run("one_view_unprojected")["error"] < 0.003
+
+
+def test_two_views_agree_at_the_spheres_radius(run):
+    assert abs(run("two_views_agreeing")["best"].median() - 0.4) < 0.002
+
+
+def test_the_half_pixel_mistake_is_as_large_as_computed(run):
+    names = run("half_pixel_mistake")
+    assert names["right"].abs().max() < 1e-3
+    assert abs(names["wrong"].mean() - 3.5) < 1e-3
+
+
+def test_the_sweep_meets_the_sphere_within_a_tenth_of_a_plane(run):
+    names = run("plane_sweep_sphere")
+    assert names["error"][names["surface"]].max() < 0.1 * names["spacing"]
+
+
+def test_two_degrees_of_pose_noise_fall_below_a_fifth_of_a_degree(run):
+    names = run("pose_noise")
+    assert abs(names["errors"][0] - 2.0).max() < 1e-3
+    assert names["final"].max() < 0.2

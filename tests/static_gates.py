@@ -22,7 +22,7 @@ GATES = [
     (r"(?<![.\w])(eval|exec)\s*\(", "**/*.py", "runs text as code"),
     (r"\balign_corners\s*=\s*True", "**/*.py", "moves every sample by up to half a pixel"),
     (
-        r"[+]\s*1e-\d+\s*\)?\s*$|/\s*\([^()]*\+\s*1e-\d+\s*\)",
+        r"/\s*\([^()]*\+\s*(1e-\d+|eps)\s*\)",
         "**/*.py",
         "a biased division: select a safe divisor first",
     ),

@@ -1,0 +1,1 @@
+"""The dispatch of backends, and what the kernels hold in memory."""

@@ -7,8 +7,9 @@ import pytest
 import torch
 from hypothesis import given
 
-from lsmgeo import CameraTensors, functional
+from lsmgeo import CameraTensors, VoxelGrid, functional
 from tests.property import support
+from tests.property.test_unproject import plain_camera
 from tests.strategies import scenes
 
 EVERYTHING = {"augment": ("depth", "direction")}
@@ -63,6 +64,28 @@ def test_nothing_is_ever_non_finite(scene):
             for leaf in (features, cameras.intrinsics, cameras.cam_from_world):
                 assert leaf.grad is not None
                 assert bool(leaf.grad.isfinite().all())
+
+
+@pytest.mark.parametrize("dtype", support.DTYPES)
+def test_site_in_the_camera_centre_gives_zero_gradient(dtype):
+    """Depth exactly 0, in a grid and as a point; the voxel in front of it is read as ever."""
+    camera = plain_camera(dtype, (3, 3))
+    pose = camera.cam_from_world.clone().requires_grad_()
+    camera = camera._replace(cam_from_world=pose)
+    features = torch.arange(9.0, dtype=dtype).reshape(1, 1, 1, 3, 3)
+    grid = VoxelGrid((2, 1, 1), lower=(-0.5, -0.5, -0.5), upper=(0.5, 0.5, 1.5))
+    volume, visible = functional.unproject(features, camera, grid, padding_mode="border")
+    assert volume[..., 0, 0, 0].item() == 0.0
+    assert visible.flatten().tolist() == [False, True]
+    volume[..., 0, :, :].sum().backward()
+    support.assert_same(pose.grad, torch.zeros_like(pose))
+    points = torch.zeros(1, 2, 3, dtype=dtype)
+    points[0, 1] = torch.tensor([1.25, 0.5, 1.0], dtype=dtype)
+    points.requires_grad_()
+    values, _ = functional.unproject_points(features, camera, points, padding_mode="border")
+    values.sum().backward()
+    expected = torch.tensor([[0.0, 0.0, 0.0], [1.0, 3.0, -1.25 - 3 * 0.5]], dtype=dtype)
+    torch.testing.assert_close(points.grad[0], expected)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])

@@ -30,7 +30,7 @@ extensions = [
 ]
 exclude_patterns = ["_build", "auto_examples/**/*.ipynb"]
 templates_path = ["_templates"]
-nitpicky = False
+default_role = "py:obj"  # single backticks link where they can
 
 # Links into other projects' inventories need the network, and their absence is a warning: on request only.
 if os.environ.get("LSMGEO_DOCS_INTERSPHINX"):

@@ -87,7 +87,7 @@ print(f"{sites.shape[1]} surface points")
 turns = torch.zeros(1, 4, 3, requires_grad=True)
 shifts = torch.zeros(1, 4, 3, requires_grad=True)
 errors = [pose_error(noisy, truth)[0, 1:]]
-for sigma, steps, rate in ((2.0, 50, 1e-2), (0.5, 250, 2e-2)):
+for sigma, steps, rate in ((2.0, 40, 1e-2), (0.5, 160, 3e-2)):
     width = 2 * int(4 * sigma) + 1
     features = gaussian_blur2d(photographs[0], (width, width), (sigma, sigma))[None]
     optimizer = torch.optim.Adam([turns, shifts], lr=rate, betas=(0.9, 0.99))
@@ -136,7 +136,7 @@ axis = axes["curve"]
 axis.semilogy(torch.stack(errors), lw=1.5)
 axis.axhline(0.2, color="black", ls=":", lw=1)
 axis.text(len(errors), 0.21, "0.2 degrees", ha="right")
-axis.axvline(50, color="gray", ls="--", lw=1)
-axis.text(53, 2.4, "sharp photographs from here", color="gray", va="center")
+axis.axvline(40, color="gray", ls="--", lw=1)
+axis.text(42, 2.6, "sharp photographs from here", color="gray", va="center")
 axis.set(title="pose error of each of the four cameras", xlabel="step", ylabel="degrees", ylim=(None, 3))
 plt.show()

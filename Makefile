@@ -5,8 +5,6 @@ SHELL := /bin/bash
 VENV  ?= .venv
 BIN   := $(VENV)/bin
 JOBS  ?= 2
-# Tests read real posed images from here; without it they skip, and say so.
-export LSMGEO_TEST_DATA
 
 # The first interpreter that is new enough.
 PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 python; do \
@@ -54,6 +52,7 @@ demo: $(VENV)/.core ## run the main job on an analytic scene; pictures go to dem
 # One thread a process: two workers of two threads each run slower than two of one.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
+# Tests on real posed images read the folder that LSMGEO_TEST_DATA names; without it they skip, and say so.
 test: $(VENV)/.dev ## whole suite, doctests, and the core's coverage
 	@rm -f .coverage .coverage.*
 	$(PYTEST) -n $(JOBS) --dist worksteal -m 'not long' --cov --cov-report= --durations=10

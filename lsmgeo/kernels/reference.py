@@ -89,8 +89,8 @@ def _per_view(z: Tensor, matrix: Tensor) -> Tensor:
 
 
 def _extent(matrix: Tensor, reach: Sequence[Tensor]) -> Tensor:
-    """A bound on every |coordinate| of ``M q``, (B, V), from bounds on |x|, |y| and |z|, each () or (B, V)."""
-    m = matrix.detach().abs().amax(-2)  # (B, V, 4)
+    """A bound on the terms of ``M q``, (B, V, ...), for M (B, V, ..., 3, 4) and bounds on |x|, |y| and |z|."""
+    m = matrix.detach().abs().amax(-2)  # (B, V, ..., 4)
     return m[..., 0] * reach[0] + m[..., 1] * reach[1] + m[..., 2] * reach[2] + m[..., 3]
 
 
@@ -109,20 +109,41 @@ def _scale_below_overflow(extent: Tensor) -> Tensor:
     return torch.exp2(-torch.log2(extent.clamp_min(LARGEST_COORDINATE) / LARGEST_COORDINATE).ceil())
 
 
-def _unit(rows: Sequence[Tensor], view_mask: Tensor | None) -> Tensor:
-    """Normalise the vector (B, V, *sites) x 3, entries at most 1, to (B, V, 3, *sites); 0 with zero gradient at 0."""
+def _unit(rows: Sequence[Tensor], terms: Tensor, view_mask: Tensor | None) -> Tensor:
+    """Normalise the vector (B, V, *sites) x 3 to (B, V, 3, *sites); 0 with zero gradient at 0.
+
+    `terms` broadcasts to (B, V, *sites): a bound on the terms whose sum the vector is. A vector as short as their
+    rounding error has no direction: the site is the camera centre.
+    """
     vector = torch.stack(list(rows), 2)
     squares = vector.square().sum(2, keepdim=True)
-    # A vector as short as the rounding error of its sum has no direction: the site is the camera centre.
-    away = squares > (4.0 * torch.finfo(vector.dtype).eps) ** 2
+    away = squares > (4.0 * torch.finfo(vector.dtype).eps * terms.to(vector.dtype)).square()[:, :, None]
     unit = torch.where(away, vector * torch.where(away, squares, 1.0).rsqrt(), 0.0)
     return _masked(unit, view_mask)
 
 
 def _lattice_directions(sites: Sites, dtype: torch.dtype) -> Tensor:
     assert sites.direction is not None
-    extent = _lattice_extent(sites.direction, sites).clamp_min(torch.finfo(torch.float64).tiny)
-    return _unit(_lattice_rows(sites.direction / extent[..., None, None], sites, dtype), sites.view_mask)
+    matrix = sites.direction / _power_of_two(sites.direction.detach().abs().amax((-1, -2)))[..., None, None]
+    # Bounded plane by plane, so that the planes of a slab come out as those of the whole.
+    z = _per_view(sites.z.detach(), matrix).abs()
+    terms = _extent(matrix[:, :, None], (sites.x.abs().amax(), sites.y.abs().amax(), z))[..., None, None]
+    return _unit(_lattice_rows(matrix, sites, dtype), terms, sites.view_mask)
+
+
+def _point_directions(
+    direction: Tensor, points: Tensor, part: slice, view_mask: Tensor | None, dtype: torch.dtype
+) -> Tensor:
+    largest = direction.detach().abs().amax((-1, -2))
+    extent = _point_extent(direction, points)
+    scale = _power_of_two(torch.maximum(extent, largest / LARGEST_COORDINATE))
+    rows = _point_rows(direction / scale[..., None, None], points[:, part], dtype)
+    return _unit(rows, (extent / scale)[..., None], view_mask)
+
+
+def _power_of_two(value: Tensor) -> Tensor:
+    """The power of two at or above a number, 1 for 0: a scale that rounds nothing."""
+    return torch.exp2(torch.log2(torch.where(value > 0, value, 1.0)).ceil())
 
 
 def _masked(values: Tensor, view_mask: Tensor | None) -> Tensor:
@@ -304,8 +325,7 @@ def unproject_points(
         values, visible, depth = _sample_through_cameras(source, rows, scale.to(dtype), view_mask, options)
         vectors = None
         if direction is not None:
-            extent = _point_extent(direction, points).clamp_min(torch.finfo(torch.float64).tiny)
-            vectors = _unit(_point_rows(direction / extent[..., None, None], part, dtype), view_mask)
+            vectors = _point_directions(direction, points, slice(start, stop), view_mask, dtype)
         return _output(values, depth, vectors, dtype if options.reduce else output), visible
 
     total = points.shape[1]

@@ -1,0 +1,250 @@
+"""Reading files that nobody vouches for, and writing files that are never half there.
+
+Everything that comes from outside is hostile until checked: sizes are compared with the file before anything is
+allocated, names stay inside their folder, and every failure is a :class:`lsmgeo.errors.DataError` that names the file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import tempfile
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lsmgeo.errors import DataError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from PIL import Image
+
+__all__ = [
+    "MAX_PIXELS",
+    "child",
+    "image_size",
+    "parse_floats",
+    "parse_ints",
+    "read_bytes",
+    "read_image",
+    "read_text",
+    "write_atomic",
+    "write_point_cloud",
+]
+
+MAX_PIXELS = 1 << 24
+MAX_TEXT_BYTES = 1 << 28
+MAX_NUMBER_LENGTH = 64
+
+
+def read_bytes(path: Path, limit: int) -> bytes:
+    """Read a regular file of at most ``limit`` bytes.
+
+    Raises:
+        DataError: the file is missing, not a plain file, unreadable, or larger than ``limit``.
+    """
+    try:
+        # A pipe or a device would block or never end, so only plain files are opened at all.
+        if not path.is_file():
+            raise DataError(path, "no such file")
+        with path.open("rb") as stream:
+            content = stream.read(limit + 1)
+    except DataError:
+        raise
+    except (OSError, ValueError) as error:
+        raise DataError(path, f"cannot be read ({error})") from error
+    if len(content) > limit:
+        raise DataError(path, f"is larger than the limit of {limit} bytes")
+    return content
+
+
+def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:
+    """Read a UTF-8 text file of at most ``limit`` bytes.
+
+    Raises:
+        DataError: as :func:`read_bytes`, or the content is not UTF-8 text.
+    """
+    try:
+        text = read_bytes(path, limit).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise DataError(path, "is not a text file (invalid UTF-8)") from error
+    if "\0" in text:
+        raise DataError(path, "is not a text file (it holds a zero byte)")
+    return text
+
+
+def child(root: Path, name: str, source: Path) -> Path:
+    """The path of ``name`` below ``root``, refusing every name that leads outside.
+
+    Args:
+        root: folder that must contain the result.
+        name: relative name as written in ``source``.
+        source: the file that gave the name, for the error message.
+
+    Raises:
+        DataError: the name is empty, absolute, not printable, or leads outside ``root`` (also through a link).
+    """
+    if not name or len(name) > 512 or not name.isprintable():
+        raise DataError(source, f"holds an unusable file name {name[:80]!r}")
+    try:
+        root = root.resolve()
+        path = (root / name).resolve()
+    except (OSError, RuntimeError, ValueError) as error:
+        raise DataError(source, f"holds an unusable file name {name[:80]!r} ({error})") from error
+    if path == root or not path.is_relative_to(root):
+        raise DataError(source, f"names a file outside its folder: {name[:80]!r}")
+    return path
+
+
+def parse_floats(tokens: Sequence[str], path: Path, where: str) -> list[float]:
+    """Finite numbers from text.
+
+    Raises:
+        DataError: a token is not a number, is not finite or is absurdly long.
+    """
+    try:
+        if any(len(token) > MAX_NUMBER_LENGTH for token in tokens):
+            raise ValueError("number too long")
+        values = [float(token) for token in tokens]
+    except ValueError as error:
+        raise DataError(path, f"{where}: expected numbers ({error})") from error
+    if not np.isfinite(values).all():
+        raise DataError(path, f"{where}: numbers must be finite")
+    return values
+
+
+def parse_ints(tokens: Sequence[str], path: Path, where: str) -> list[int]:
+    """Whole numbers from text that fit 64 bits.
+
+    Raises:
+        DataError: a token is not a whole number or needs more than 64 bits.
+    """
+    try:
+        if any(len(token) > 20 for token in tokens):
+            raise ValueError("number too long")
+        values = [int(token) for token in tokens]
+    except ValueError as error:
+        raise DataError(path, f"{where}: expected whole numbers ({error})") from error
+    if any(not -(2**63) <= value < 2**63 for value in values):
+        raise DataError(path, f"{where}: whole numbers must fit 64 bits")
+    return values
+
+
+def image_size(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[int, int]:
+    """The (height, width) that a PNG or JPEG states in its header; no pixel is decoded.
+
+    Raises:
+        DataError: not a PNG or JPEG, or more than ``max_pixels``.
+    """
+    with _open_image(path, max_pixels) as image:
+        return image.size[1], image.size[0]
+
+
+def read_image(path: Path, size: tuple[int, int] | None = None, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Read a PNG or JPEG photograph as 8-bit RGB.
+
+    Args:
+        path: the image file.
+        size: expected (height, width); checked before a pixel is decoded.
+        max_pixels: largest number of pixels accepted.
+
+    Returns:
+        (H, W, 3) uint8.
+
+    Raises:
+        DataError: not a PNG or JPEG, another size than expected, too large, or damaged.
+    """
+    with _open_image(path, max_pixels) as image:
+        width, height = image.size
+        if size is not None and (height, width) != tuple(size):
+            reason = f"is {width} x {height} pixels (width x height); its camera expects {size[1]} x {size[0]}"
+            raise DataError(path, reason)
+        if image.mode not in ("1", "L", "LA", "P", "RGB", "RGBA", "CMYK"):
+            raise DataError(path, f"has mode {image.mode}; expected an 8-bit picture")
+        return np.array(image.convert("RGB"))
+
+
+@contextlib.contextmanager
+def _open_image(path: Path, max_pixels: int) -> Iterator[Image.Image]:
+    from PIL import Image
+
+    content = read_bytes(path, 4096 + 8 * max_pixels)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            # Sniffing among all of Pillow's formats would reach parsers (EPS, FITS) that run programs or expand files.
+            with Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
+                width, height = image.size
+                if width * height > max_pixels:
+                    raise DataError(path, f"has {width} x {height} pixels, the limit is {max_pixels}")
+                yield image
+    except DataError:
+        raise
+    # Pillow's decoders raise OSError, SyntaxError, ValueError, struct.error, zlib.error and more on damaged files.
+    except Exception as error:
+        raise DataError(path, f"is not a readable PNG or JPEG picture ({error})") from error
+
+
+def write_atomic(path: str | os.PathLike[str], content: bytes) -> Path:
+    """Write a file so that it is either wholly there or not at all.
+
+    The bytes go to a temporary file beside the target, reach the disk, and replace the target in one step; parents
+    are created.
+
+    Raises:
+        DataError: the folder or the file cannot be written; nothing half-written stays.
+    """
+    path = Path(path)
+    temporary = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+        temporary = Path(name)
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        # mkstemp makes a private file; a result should have the permissions that the user's umask gives.
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        temporary.replace(path)
+        temporary = None
+    except OSError as error:
+        raise DataError(path, f"cannot be written ({error})") from error
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+    return path
+
+
+def write_point_cloud(path: str | os.PathLike[str], positions: np.ndarray, colours: np.ndarray) -> Path:
+    """Write coloured points as a binary PLY file, atomically.
+
+    Args:
+        path: the file to write.
+        positions: (N, 3) world coordinates, N >= 1.
+        colours: (N, 3) uint8 RGB.
+
+    Returns:
+        The path written.
+
+    Raises:
+        DataError: there is no point, shapes do not agree, a position is not finite, or the file cannot be written.
+    """
+    positions = np.asarray(positions)
+    colours = np.asarray(colours)
+    if positions.ndim != 2 or positions.shape[1:] != (3,) or len(positions) == 0:
+        raise DataError(path, f"positions must be (N, 3) with N >= 1; got {positions.shape}")
+    if colours.shape != positions.shape or colours.dtype != np.uint8:
+        raise DataError(path, f"colours must be {positions.shape} uint8; got {colours.shape} {colours.dtype}")
+    if not np.isfinite(positions).all():
+        raise DataError(path, "positions must be finite")
+    import trimesh
+
+    content = trimesh.PointCloud(positions, colors=colours).export(file_type="ply")
+    return write_atomic(path, content)

@@ -1,0 +1,91 @@
+"""Middlebury multi-view scenes: a folder of photographs and one ``*_par.txt`` with their cameras."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lsmgeo.cameras import from_opencv
+from lsmgeo.data.files import child, image_size, parse_floats, parse_ints, read_text
+from lsmgeo.data.posed import PosedImages
+from lsmgeo.errors import DataError, LsmGeoError
+
+__all__ = ["parameter_files", "read_middlebury"]
+
+MAX_PARAMETER_BYTES = 1 << 24
+
+
+def parameter_files(folder: Path) -> list[Path]:
+    """The ``*_par.txt`` files of a folder, sorted."""
+    return sorted(path for path in folder.glob("*_par.txt") if path.is_file())
+
+
+def read_middlebury(path: str | Path) -> PosedImages:
+    """Read a Middlebury multi-view scene.
+
+    The file's first line counts the photographs; every other line is ``name K (9) R (9) t (3)`` with the projection
+    ``K [R | t]``. (Seitz, Curless, Diebel, Scharstein, Szeliski, "A comparison and evaluation of multi-view stereo
+    reconstruction algorithms", CVPR 2006.)
+
+    Convention:
+        The source has our own convention (world-to-camera, OpenCV axes, integer pixel centres); nothing is changed.
+
+    Args:
+        path: the scene's folder, or its ``*_par.txt``.
+
+    Returns:
+        The photographs with their cameras, no sparse points.
+
+    Raises:
+        DataError: a file is missing, damaged, too large, names a file outside the folder, or holds no camera.
+    """
+    path = Path(path)
+    files = parameter_files(path) if path.is_dir() else [path]
+    if len(files) != 1:
+        found = ", ".join(file.name for file in files[:5]) or "none"
+        raise DataError(path, f"expected one *_par.txt file; found {found}")
+    file = files[0]
+    lines = [line.split() for line in read_text(file, MAX_PARAMETER_BYTES).splitlines() if line.strip()]
+    if not lines or len(lines[0]) != 1:
+        raise DataError(file, "the first line must be the number of photographs")
+    (count,) = parse_ints(lines[0], file, "line 1")
+    if count != len(lines) - 1 or count < 1:
+        raise DataError(file, f"announces {count} photographs and holds {len(lines) - 1} lines of cameras")
+
+    names, paths, sizes = [], [], []
+    numbers = np.zeros((count, 21))
+    for view, tokens in enumerate(lines[1:]):
+        where = f"line {view + 2}"
+        if len(tokens) != 22:
+            raise DataError(file, f"{where}: expected a name and 21 numbers; got {len(tokens)} items")
+        numbers[view] = parse_floats(tokens[1:], file, where)
+        _check_camera(numbers[view, :9].reshape(3, 3), numbers[view, 9:18].reshape(3, 3), file, where)
+        names.append(tokens[0])
+        paths.append(child(file.parent, tokens[0], file))
+        # The format does not state the size, so it comes from the picture's own header.
+        sizes.append(image_size(paths[-1]))
+    if len(set(names)) != count:
+        raise DataError(file, "names a photograph twice")
+    height, width = torch.tensor(sizes).unbind(-1)
+    K, R, t = torch.from_numpy(numbers).split((9, 9, 3), -1)
+    try:
+        cameras = from_opencv(K.reshape(-1, 3, 3), R.reshape(-1, 3, 3), t, height, width)
+    except LsmGeoError as error:
+        raise DataError(file, str(error)) from error
+    return PosedImages(tuple(names), tuple(paths), cameras, None, "middlebury")
+
+
+def _check_camera(intrinsics: np.ndarray, rotation: np.ndarray, file: Path, where: str) -> None:
+    lower = intrinsics[[1, 2, 2], [0, 0, 1]]
+    if np.abs(lower).max() > 1e-9 or abs(intrinsics[2, 2] - 1) > 1e-9 or min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
+        raise DataError(file, f"{where}: K must be upper triangular with positive focal lengths and last row 0 0 1")
+    if np.abs(intrinsics).max() > 1e7:
+        raise DataError(file, f"{where}: K holds a number beyond 1e7 pixels")
+    if (
+        np.abs(rotation).max() > 2
+        or np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3
+        or np.linalg.det(rotation) < 0
+    ):
+        raise DataError(file, f"{where}: R is not a rotation")

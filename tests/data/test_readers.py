@@ -1,0 +1,121 @@
+"""The readers give back what an independent writer wrote, in our conventions."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from lsmgeo import data
+from lsmgeo.errors import DataError
+from tests.data.writers import make_scene, project, write_colmap, write_middlebury
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene()
+
+
+def check_cameras(read, scene):
+    np.testing.assert_allclose(read.cameras.intrinsics.numpy(), scene.K, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(read.cameras.cam_from_world[:, :3, :3].numpy(), scene.R, atol=1e-12)
+    np.testing.assert_allclose(read.cameras.cam_from_world[:, :3, 3].numpy(), scene.t, atol=1e-12)
+    assert read.cameras.height.tolist() == [72] * 5
+    assert read.cameras.width.tolist() == [96] * 5
+
+
+def check_images(read, scene):
+    for view, image in enumerate(scene.images):
+        expected = torch.from_numpy(image).permute(2, 0, 1).to(torch.float32) / 255
+        torch.testing.assert_close(read.load(view), expected, rtol=0, atol=0)
+
+
+def test_a_middlebury_folder_reads_back(scene, tmp_path):
+    read = data.open(write_middlebury(scene, tmp_path))
+    assert read.source == "middlebury"
+    assert read.names == ("v0.png", "v1.png", "v2.png", "v4.png", "view_3.png")
+    assert read.points is None
+    check_cameras(read, scene)
+    check_images(read, scene)
+    assert data.open(tmp_path / "scene_par.txt").names == read.names
+
+
+@pytest.mark.parametrize("form", ["text", "binary"])
+@pytest.mark.parametrize("sparse", [".", "sparse", "sparse/0"])
+def test_a_colmap_model_reads_back(scene, tmp_path, form, sparse):
+    read = data.open(write_colmap(scene, tmp_path, form=form, sparse=sparse))
+    assert read.source == "colmap"
+    assert read.names == tuple(scene.names)
+    check_cameras(read, scene)
+    check_images(read, scene)
+    np.testing.assert_allclose(read.points.positions, scene.points, rtol=0, atol=0)
+    np.testing.assert_array_equal(read.points.colours, scene.colours)
+    for view, observed in enumerate(read.points.observations):
+        assert sorted(observed.points) == list(range(len(scene.points)))
+        np.testing.assert_allclose(observed.pixels, project(scene, view)[observed.points], atol=1e-9)
+
+
+def test_a_simple_pinhole_camera_has_one_focal_length(scene, tmp_path):
+    write_colmap(scene, tmp_path, form="text")
+    cameras = "\n".join(f"{index} SIMPLE_PINHOLE 96 72 100 48 36" for index in range(1, 6))
+    (tmp_path / "sparse/0/cameras.txt").write_text(cameras)
+    read = data.read_colmap(tmp_path)
+    expected = torch.tensor([[100, 0, 47.5], [0, 100, 35.5], [0, 0, 1]], dtype=torch.float64)
+    torch.testing.assert_close(read.cameras.intrinsics[3], expected, rtol=0, atol=0)
+
+
+def test_a_photograph_may_observe_nothing(scene, tmp_path):
+    write_colmap(scene, tmp_path, form="text")
+    file = tmp_path / "sparse/0/images.txt"
+    lines = file.read_text().splitlines()
+    lines[3] = ""  # the observations of the first record, which is the last photograph
+    file.write_text("\n".join(lines) + "\n")
+    counts = [len(observed.points) for observed in data.open(tmp_path).points.observations]
+    assert counts == [42, 42, 42, 42, 0]
+
+
+def test_a_photograph_of_another_size_than_its_camera_is_refused(scene, tmp_path):
+    read = data.open(write_colmap(scene, tmp_path, form="binary"))
+    Image.fromarray(scene.images[1][:, :50]).save(read.paths[1])
+    with pytest.raises(DataError, match=r"50 x 72 .* expects 96 x 72"):
+        read.load(1)
+
+
+def test_a_point_cloud_reads_back_and_leaves_nothing_else(tmp_path):
+    import trimesh
+
+    positions = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
+    colours = np.random.default_rng(1).integers(0, 256, (20, 3), dtype=np.uint8)
+    path = data.write_point_cloud(tmp_path / "new" / "points.ply", positions, colours)
+    read = trimesh.load(path)
+    np.testing.assert_allclose(read.vertices, positions, rtol=1e-6)
+    np.testing.assert_array_equal(read.colors[:, :3], colours)
+    assert [file.name for file in path.parent.iterdir()] == ["points.ply"]
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
+    path = data.write_atomic(tmp_path / "result", b"old")
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(DataError, match="No space left"):
+        data.write_atomic(path, b"new and longer")
+    assert path.read_bytes() == b"old"
+    assert [file.name for file in tmp_path.iterdir()] == ["result"]
+
+
+@pytest.mark.parametrize(
+    ("positions", "colours"),
+    [
+        (np.zeros((0, 3)), np.zeros((0, 3), np.uint8)),
+        (np.zeros((2, 2)), np.zeros((2, 2), np.uint8)),
+        (np.zeros((2, 3)), np.zeros((3, 3), np.uint8)),
+        (np.zeros((2, 3)), np.zeros((2, 3))),
+        (np.full((2, 3), np.nan), np.zeros((2, 3), np.uint8)),
+    ],
+)
+def test_a_point_cloud_that_makes_no_sense_is_refused(tmp_path, positions, colours):
+    with pytest.raises(DataError):
+        data.write_point_cloud(tmp_path / "points.ply", positions, colours)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,174 @@
+"""Real photographs with measured geometry: each set's figure is reached through our readers and converters.
+
+The folder is named by ``LSMGEO_TEST_DATA``; the sets themselves cannot be distributed.
+"""
+
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from lsmgeo import cli, data
+from lsmgeo.cameras import CameraTensors, from_opencv, from_opengl
+from lsmgeo.classical import reconstruct_view
+from lsmgeo.functional import sample_views
+
+ROOT = os.environ.get("LSMGEO_TEST_DATA")
+pytestmark = pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of real photographs")
+
+
+def folder(name):
+    path = Path(ROOT) / name
+    if not path.is_dir():
+        pytest.skip(f"LSMGEO_TEST_DATA holds no {name}")
+    return path
+
+
+def fundamental(cameras: CameraTensors, first: int, second: int) -> np.ndarray:
+    """F with ``x2^T F x1 = 0``, from K and the relative pose."""
+    K, E = cameras.intrinsics.double().numpy(), cameras.cam_from_world.double().numpy()
+    relative = E[second] @ np.linalg.inv(E[first])
+    x, y, z = relative[:3, 3]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.linalg.inv(K[second]).T @ cross @ relative[:3, :3] @ np.linalg.inv(K[first])
+
+
+def epipolar_errors(cameras, images, pairs, *, sampson=False):
+    """Distances in pixels of SIFT matches from their epipolar lines: the mean of both pictures, or Sampson's."""
+    sift = cv2.SIFT_create()
+    found = {}
+    for index in {index for pair in pairs for index in pair}:
+        found[index] = sift.detectAndCompute(cv2.cvtColor(images[index], cv2.COLOR_RGB2GRAY), None)
+    errors = []
+    for first, second in pairs:
+        (keys1, words1), (keys2, words2) = found[first], found[second]
+        matches = cv2.BFMatcher().knnMatch(words1, words2, k=2)
+        good = [best for best, other in matches if best.distance < 0.7 * other.distance]
+        a = np.array([(*keys1[match.queryIdx].pt, 1.0) for match in good])
+        b = np.array([(*keys2[match.trainIdx].pt, 1.0) for match in good])
+        F = fundamental(cameras, first, second)
+        residual = np.abs((b @ F * a).sum(1))
+        normal1, normal2 = np.hypot(*(b @ F)[:, :2].T), np.hypot(*(a @ F.T)[:, :2].T)
+        distance = residual / np.hypot(normal1, normal2) if sampson else 0.5 * residual * (1 / normal1 + 1 / normal2)
+        errors.append(distance[distance < 3.0])  # beyond that a match is wrong, not inexact
+    return np.concatenate(errors)
+
+
+def test_temple_epipolar_error():
+    scene = data.open(folder("middlebury_temple"))
+    images = [data.read_image(path) for path in scene.paths]
+    assert len(scene) == 16
+    errors = epipolar_errors(scene.cameras, images, [(0, 1), (2, 3), (3, 4), (5, 6), (6, 7), (7, 8), (8, 9), (11, 12)])
+    assert len(errors) > 500
+    assert np.median(errors) < 0.18
+
+
+def test_fountain_epipolar_error():
+    path = folder("strecha_fountain_quarter")
+    entries = json.loads((path / "cameras.json").read_text())["cameras"]
+    K, R, t = (torch.tensor([entry[name] for entry in entries], dtype=torch.float64) for name in ("K", "R", "t"))
+    cameras = from_opencv(K, R, t, entries[0]["height"], entries[0]["width"])
+    images = [data.read_image(path / entry["name"]) for entry in entries]
+    errors = epipolar_errors(cameras, images, [(index, index + 1) for index in range(0, 10, 2)])
+    assert len(errors) > 500
+    assert np.median(errors) < 0.10
+
+
+def test_nerf_epipolar_error():
+    path = folder("nerf_lego")
+    meta = json.loads((path / "transforms_train.json").read_text())
+    frames = meta["frames"]
+    # On white: cut out against the black of transparent pixels, the edges would move.
+    pictures = [cv2.imread(str(path / f"{frame['file_path']}.png"), cv2.IMREAD_UNCHANGED) for frame in frames]
+    alphas = [picture[..., 3:] / 255.0 for picture in pictures]
+    images = [
+        np.round(picture[..., 2::-1] * alpha + 255 * (1 - alpha)).astype(np.uint8)
+        for picture, alpha in zip(pictures, alphas, strict=True)
+    ]
+    height, width = images[0].shape[:2]
+    focal = 0.5 * width / np.tan(0.5 * meta["camera_angle_x"])
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
+    poses = torch.tensor([frame["transform_matrix"] for frame in frames], dtype=torch.float64)
+    cameras = from_opengl(K.expand(len(frames), 3, 3), poses, height, width)
+    # The two frames 7 degrees apart; all others are too far from each other to match.
+    pair = [[frame["file_path"] for frame in frames].index(f"./train/r_{number}") for number in (70, 55)]
+    errors = epipolar_errors(cameras, images, [pair], sampson=True)
+    assert len(errors) > 100
+    assert np.median(errors) < 0.17
+
+
+def test_colmap_reprojection_error():
+    scene = data.open(folder("colmap_scene"))
+    assert len(scene) == 23
+    assert len(scene.points.positions) == 1443
+    errors = []
+    for view, observed in enumerate(scene.points.observations):
+        E = scene.cameras.cam_from_world[view].numpy()
+        pixels, _ = cv2.projectPoints(
+            scene.points.positions[observed.points], E[:3, :3], E[:3, 3], scene.cameras.intrinsics[view].numpy(), None
+        )
+        errors.append(np.linalg.norm(pixels[:, 0] - observed.pixels, axis=1))
+    errors = np.concatenate(errors)
+    assert len(errors) == 5931
+    np.testing.assert_allclose(np.median(errors), 0.245, atol=0.005)
+    np.testing.assert_allclose(np.sqrt(np.mean(errors**2)), 0.366, atol=0.005)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [("00005.png", "00010.png"), ("00010.png", "00015.png"), ("00055.png", "00060.png"), ("00090.png", "00095.png")],
+)
+def test_hololens_depth_of_one_frame_is_that_of_another(first, second):
+    path = folder("hololens_rgbd")
+    K = torch.from_numpy(np.loadtxt(path / "K.txt"))
+    rows = (path / "frame_index.txt").read_text().split()
+    poses = np.loadtxt(path / "poses.txt").reshape(-1, 4, 4)
+    world_from_cam = [torch.from_numpy(poses[rows.index(name)]) for name in (first, second)]
+    E = torch.stack([torch.linalg.inv(pose) for pose in world_from_cam])
+    files = [str(path / "depth" / name) for name in (first, second)]
+    depths = [torch.from_numpy(cv2.imread(file, cv2.IMREAD_UNCHANGED) / 1000.0) for file in files]
+    height, width = depths[0].shape
+    cameras = from_opencv(K.expand(2, 3, 3), E[:, :3, :3], E[:, :3, 3], height, width)
+    v, u = torch.nonzero(depths[0] > 0, as_tuple=True)
+    rays = torch.linalg.solve(cameras.intrinsics[0], torch.stack([u, v, torch.ones_like(u)]).double())
+    camera = rays * depths[0][v, u]
+    world = cameras.cam_from_world[0, :3, :3].T @ (camera - cameras.cam_from_world[0, :3, 3:])
+    moved = cameras.cam_from_world[1, :3, :3] @ world + cameras.cam_from_world[1, :3, 3:]
+    pixels = (cameras.intrinsics[1] @ moved)[:2] / moved[2]
+    sampled = sample_views(
+        depths[1][None, None, None],
+        pixels.T[None, None],
+        moved[2][None, None],
+        (moved[2] > 0)[None, None],
+        mode="nearest",
+    )
+    there = sampled.volume[0, 0, 0]
+    both = sampled.visible[0, 0] & (there > 0)
+    errors = ((moved[2] - there).abs() / there)[both]
+    assert int(both.sum()) > 30_000
+    assert float(errors.median()) < 0.003
+    assert float((errors < 0.02).double().mean()) > 0.97
+
+
+def test_colmap_depth_error_at_its_own_points():
+    scene = data.open(folder("colmap_scene"))
+    result = reconstruct_view(scene, 5, size=250)
+    assert result.error.points > 200
+    assert result.error.median < 0.005
+
+
+def test_the_temple_lies_inside_its_published_box(tmp_path, capsys):
+    path = folder("middlebury_temple")
+    arguments = ["reconstruct", str(path), "--view", "6", "--size", "200", "--out", str(tmp_path)]
+    assert cli.main(arguments) == 0
+    import trimesh
+
+    points = np.asarray(trimesh.load(tmp_path / "points.ply").vertices)
+    assert len(points) > 3000
+    lower, upper = np.array([-0.073568, 0.021728, -0.012445]), np.array([0.028855, 0.181892, 0.062736])
+    inside = ((points > lower - 0.003) & (points < upper + 0.003)).all(1)
+    assert inside.mean() > 0.9

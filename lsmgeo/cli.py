@@ -1,0 +1,169 @@
+"""The command line: ``lsmgeo demo``, ``lsmgeo reconstruct``. Heavy imports wait until a command runs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Literal
+
+__all__ = ["demo", "main", "reconstruct"]
+
+
+def demo(out: str = "lsmgeo-demo") -> None:
+    """Recover the depth of a known scene from six pictures of it, and draw how.
+
+    Args:
+        out: folder for the picture; created where it does not exist.
+    """
+    from pathlib import Path
+
+    from lsmgeo.demo import run_demo, write_picture
+
+    result = run_demo()
+    errors = result.error[result.error.isfinite()]
+    path = write_picture(result, Path(out) / "demo.png")
+    print(f"voxels:                        {' x '.join(map(str, result.grid.shape))}")  # type: ignore[arg-type]
+    print(f"views:                         {len(result.images)}")
+    print(f"surface pixels compared:       {len(errors)}")
+    print(f"median relative depth error:   {100 * result.median_error:.3f} %")
+    print(f"pixels within 1 %:             {100 * float((errors < 0.01).double().mean()):.1f} %")
+    print(f"time of the operators:         {result.seconds:.1f} s")
+    print(f"picture:                       {path.resolve()}")
+
+
+def reconstruct(
+    scene: str,
+    method: Literal["sweep"] = "sweep",
+    view: int | str = 0,
+    out: str = "lsmgeo-reconstruct",
+    neighbours: int = 4,
+    size: int = 400,
+    planes: int | None = None,
+    near: float | None = None,
+    far: float | None = None,
+    density: float = 0.4,
+    depth_format: Literal["npy", "png"] = "npy",
+    memory: int = 1024,
+) -> None:
+    """Reconstruct what one of a scene's posed photographs sees: depth, coloured points, and a summary picture.
+
+    Args:
+        scene: folder with a Middlebury *_par.txt or a COLMAP model of undistorted photographs.
+        method: "sweep" is plane-sweep stereo.
+        view: the reference photograph, its number (by name, from 0) or its name.
+        out: folder for the results; created where it does not exist.
+        neighbours: number of other photographs to match with.
+        size: longer side of the depth map in pixels.
+        planes: number of depth planes; by default a step is about a pixel.
+        near: nearest depth in world units; by default told from the scene.
+        far: farthest depth.
+        density: largest fraction of the pixels to keep.
+        depth_format: "npy" (float32, world units) or "png" (16 bit, scaled; the scale is printed).
+        memory: MiB that the sweep may take.
+    """
+    import io
+    import time
+    from pathlib import Path
+
+    import numpy as np
+    import torch
+
+    from lsmgeo import data
+    from lsmgeo.classical import pictures, reconstruct_view
+    from lsmgeo.errors import OptionError
+
+    start = time.perf_counter()
+    images = data.open(scene)
+    if isinstance(view, str):
+        if view not in images.names:
+            raise OptionError(f"view must be 0..{len(images) - 1} or a photograph's name; got {view!r}")
+        view = images.names.index(view)
+    result = reconstruct_view(
+        images,
+        view,
+        neighbours=neighbours,
+        size=size,
+        planes=planes,
+        near=near,
+        far=far,
+        density=density,
+        memory=memory << 20,
+        progress=True,
+    )
+    name = images.names[view]
+    depth = torch.where(result.mask, result.depth_map.depth, 0.0)
+    folder = Path(out)
+    written = {}
+    if depth_format == "npy":
+        buffer = io.BytesIO()
+        np.save(buffer, depth.numpy())
+        written["depth"] = data.write_atomic(folder / "depth.npy", buffer.getvalue())
+    else:
+        unit = float(result.depths[-1]) / 65000
+        written[f"depth in steps of {unit:.6g}"] = data.write_atomic(
+            folder / "depth16.png", pictures.depth_as_png16(depth, unit)
+        )
+    coloured = pictures.png(pictures.coloured_depth(depth, result.mask))
+    written["depth in colours"] = data.write_atomic(folder / "depth.png", coloured)
+    if len(result.points):
+        written["points"] = data.write_point_cloud(folder / "points.ply", result.points, result.colours)
+    title = f"{Path(scene).name}, view {view} ({name}), plane sweep"
+    written["summary"] = data.write_atomic(folder / "summary.png", pictures.summary(result, title))
+
+    height, width = result.mask.shape
+    print(f"scene:       {len(images)} photographs, {images.source}")
+    print(f"view:        {view} ({name}), matched with {', '.join(images.names[other] for other in result.neighbours)}")
+    first, last = float(result.depths[0]), float(result.depths[-1])
+    print(f"sweep:       {width} x {height} pixels, {len(result.depths)} planes from {first:.4g} to {last:.4g}")
+    print(f"memory:      at most {memory} MiB beyond the libraries and the photographs")
+    print(f"kept:        {int(result.mask.sum())} pixels, {100 * float(result.mask.float().mean()):.1f} %")
+    if result.error is not None:
+        error = result.error
+        print(
+            f"depth error: median {100 * error.median:.3f} % of the depth at {error.points} of {error.observed} sparse "
+            f"points, at {100 * density:.0f} % density"
+        )
+    print(f"time:        {time.perf_counter() - start:.1f} s")
+    for what, path in written.items():
+        print(f"{what + ':':<28} {path.resolve()}")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: by default those of the process.
+
+    Returns:
+        The exit status: 0, 2 after a wrong argument or a file that cannot be used, 130 after an interrupt.
+    """
+    from importlib.metadata import PackageNotFoundError, version
+
+    from jsonargparse import auto_cli
+
+    from lsmgeo.errors import LsmGeoError
+
+    try:
+        release = version("lsmgeo")
+    except PackageNotFoundError:
+        from lsmgeo import __version__ as release
+    try:
+        auto_cli(
+            {"demo": demo, "reconstruct": reconstruct},
+            args=None if arguments is None else list(arguments),
+            as_positional=True,
+            prog="lsmgeo",
+            version=release,
+            description="Features between images and 3D space.",
+        )
+    except LsmGeoError as error:
+        print(f"lsmgeo: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("lsmgeo: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

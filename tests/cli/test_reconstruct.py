@@ -1,0 +1,201 @@
+"""``lsmgeo reconstruct`` on a plane known in closed form, from files in either format."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from lsmgeo import cli, data
+from lsmgeo.classical import DepthMap, default_depth_range, kept, reconstruct_view, select_neighbours
+from lsmgeo.classical.patches import patch_features, patch_frames
+from lsmgeo.classical.plane_sweep import slab_planes, sweep
+from lsmgeo.classical.views import common_point
+from lsmgeo.errors import OptionError
+from lsmgeo.functional import view_statistics
+from tests.data.writers import make_scene, write_colmap, write_middlebury
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene()
+
+
+@pytest.fixture(scope="module", params=["middlebury", "text", "binary"])
+def folder(request, scene, tmp_path_factory):
+    path = tmp_path_factory.mktemp(request.param)
+    if request.param == "middlebury":
+        return write_middlebury(scene, path)
+    return write_colmap(scene, path, form=request.param)
+
+
+def read_picture(path):
+    with Image.open(path) as picture:
+        return np.array(picture)
+
+
+def check_depth(depth, expected):
+    """At least 30 % of the pixels, half of them within 0.1 % and 95 % within 1 %."""
+    found = depth > 0
+    assert found.mean() > 0.3
+    errors = np.abs(depth - expected)[found] / expected[found]
+    assert np.median(errors) < 1e-3
+    assert np.quantile(errors, 0.95) < 1e-2
+
+
+def test_reconstruct_writes_the_depth_of_the_scene(scene, folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert cli.main(["reconstruct", str(folder), "--method", "sweep", "--view", "1", "--out", str(out)]) == 0
+    check_depth(np.load(out / "depth.npy"), scene.depth[1])
+    printed = capsys.readouterr().out
+    is_colmap = "middlebury" not in folder.name
+    assert ("depth error: median" in printed) == is_colmap
+    names = ["depth.npy", "depth.png", "points.ply", "summary.png"]
+    assert sorted(path.name for path in out.iterdir()) == names
+    for name in names:
+        assert str((out / name).resolve()) in printed
+    assert read_picture(out / "depth.png").shape == (72, 96, 4)
+    assert min(read_picture(out / "summary.png").shape[:2]) > 300
+
+    import trimesh
+
+    cloud = trimesh.load(out / "points.ply")
+    normal = np.array([0.25, -0.15, 1.0]) / np.linalg.norm([0.25, -0.15, 1.0])
+    assert np.median(np.abs(np.asarray(cloud.vertices) @ normal)) < 2e-3
+
+
+def test_the_sixteen_bit_picture_holds_the_depth(scene, folder, tmp_path, capsys):
+    arguments = ["reconstruct", str(folder), "--view", "v0.png", "--out", str(tmp_path), "--depth_format", "png"]
+    assert cli.main([*arguments, "--near", "1.5", "--far", "2.6", "--planes", "48"]) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if "depth in steps of" in line)
+    unit = float(line.split("steps of ")[1].split(":")[0])
+    check_depth(read_picture(tmp_path / "depth16.png") * unit, scene.depth[0])
+
+
+def test_the_error_at_the_sparse_points_is_the_exact_one(scene, tmp_path):
+    read = data.open(write_colmap(scene, tmp_path, form="binary"))
+    result = reconstruct_view(read, 1, density=1.0)
+    assert result.error.observed == 42
+    assert result.error.points >= 30
+    assert result.error.median < 2e-3
+
+
+def test_slabs_do_not_change_the_result(scene, tmp_path):
+    read = data.open(write_middlebury(scene, tmp_path))
+    small = 128 << 20
+    least = next(size for size in range(small, small + (64 << 20), 1 << 20) if _fits(size))
+    assert slab_planes(5, 14, (72, 96), least) < 6
+    first = reconstruct_view(read, 0, planes=24, memory=least).depth_map
+    second = reconstruct_view(read, 0, planes=24).depth_map
+    for one, other in zip(first, second, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
+
+
+def _fits(memory):
+    try:
+        slab_planes(5, 14, (72, 96), memory)
+    except OptionError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--view", "9"], "view must lie in 0..4; got 9"),
+        (["--view", "nobody.png"], "a photograph's name; got 'nobody.png'"),
+        (["--density", "0"], "density must lie in"),
+        (["--neighbours", "1"], "neighbours must be at least 2"),
+        (["--size", "3"], "size must be at least 16"),
+        (["--planes", "2"], "planes must be at least 3"),
+        (["--near", "3", "--far", "2"], "near and far must be positive"),
+        (["--memory", "1"], "memory must be at least"),
+    ],
+)
+def test_wrong_options_give_one_line_and_status_2(folder, tmp_path, capsys, arguments, message):
+    assert cli.main(["reconstruct", str(folder), "--out", str(tmp_path / "out"), *arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith("lsmgeo: error: ")
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_scene_gives_one_line_and_status_2(tmp_path, capsys):
+    assert cli.main(["reconstruct", str(tmp_path / "nowhere")]) == 2
+    assert capsys.readouterr().err == f"lsmgeo: error: {tmp_path / 'nowhere'}: no such folder\n"
+
+
+def test_two_photographs_are_too_few(scene, tmp_path, capsys):
+    file = write_middlebury(scene, tmp_path) / "scene_par.txt"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join(["2", *lines[1:3]]))
+    assert cli.main(["reconstruct", str(tmp_path)]) == 2
+    assert "has 1 usable neighbours; matching needs at least 2" in capsys.readouterr().err
+
+
+def test_views_are_chosen_by_angle_and_not_twice(scene, tmp_path):
+    read = data.open(write_middlebury(scene, tmp_path))
+    np.testing.assert_allclose(common_point(read.cameras), 0, atol=1e-9)  # all look at the origin
+    chosen = select_neighbours(read, 0, 4)
+    assert len(chosen) == len(set(chosen)) == 4
+    assert 0 not in chosen
+    double = scene._replace(**{name: np.concatenate([value[:4], value[:1]]) for name, value in (
+        ("K", scene.K), ("R", scene.R), ("t", scene.t))})  # fmt: skip
+    doubled = data.open(write_middlebury(double, tmp_path))
+    assert 4 not in select_neighbours(doubled, 0, 4)  # stands where the reference stands
+    assert sum(index in (0, 4) for index in select_neighbours(doubled, 1, 4)) == 1
+
+
+def test_the_default_range_covers_the_scene(scene, folder):
+    near, far = default_depth_range(data.open(folder), 0, [1, 2])
+    depth = scene.points @ scene.R[0][2] + scene.t[0][2]
+    assert 1.0 < near < depth.min()
+    assert depth.max() < far < 3.0
+
+
+def test_variance_of_patches_is_one_minus_their_correlation():
+    images = torch.rand(4, 3, 9, 11, generator=torch.Generator().manual_seed(0))
+    features = patch_features(images, torch.eye(2, dtype=torch.float64).expand(4, 2, 2), noise=1e-6)
+    y, x = 4, 5
+    patches = torch.einsum("vchw,c->vhw", images, torch.tensor([0.299, 0.587, 0.114]))[:, y - 1 : y + 2, x - 1 : x + 2]
+    correlation = np.corrcoef(patches.reshape(4, 9).double().numpy())
+    expected = 1 - correlation[np.triu_indices(4, 1)].mean()
+    volume = features[None, :, :, y, x, None]
+    variance = view_statistics(volume, torch.ones(1, 4, 1, dtype=torch.bool), "variance")
+    np.testing.assert_allclose(float(variance.sum()) * 4 / 3, expected, rtol=1e-5)
+
+
+def test_patches_without_texture_resemble_nothing():
+    images = torch.full((3, 3, 5, 5), 0.4)
+    features = patch_features(images, torch.eye(2, dtype=torch.float64).expand(3, 2, 2))
+    variance = view_statistics(features[None], torch.ones(1, 3, 5, 5, dtype=torch.bool), "variance")
+    torch.testing.assert_close(variance.sum(1) * 3 / 2, torch.ones(1, 5, 5))
+
+
+def test_patch_frames_turn_with_the_camera(scene, tmp_path):
+    read = data.open(write_middlebury(scene, tmp_path))
+    frames = patch_frames(read.cameras, 2.0)
+    torch.testing.assert_close(frames[0], torch.eye(2, dtype=torch.float64))
+    assert float(frames[2].diagonal().max()) < -0.8  # upside down
+    assert float(frames[1].diagonal().min()) > 0.8
+
+
+def test_kept_pixels_are_the_best_and_specks_go():
+    confidence = torch.linspace(0, 1, 64).reshape(8, 8)
+    depth_map = DepthMap(torch.ones(8, 8), confidence, torch.zeros(8, 8), torch.full((8, 8), 5.0))
+    assert int(kept(depth_map, 0.25).sum()) == 16
+    assert int(kept(depth_map, 1.0, least=0.5).sum()) == 32
+    planes = torch.full((8, 8), 5.0)
+    planes[6, 6] = 20.0
+    mask = kept(depth_map._replace(planes=planes), 0.25, specks=4)
+    assert int(mask.sum()) == 15
+    assert not bool(mask[6, 6])
+
+
+def test_a_sweep_needs_three_planes_and_enough_views(scene, tmp_path):
+    read = data.open(write_middlebury(scene, tmp_path))
+    images = torch.stack([read.load(index) for index in range(5)])
+    with pytest.raises(OptionError, match="at least 3 planes"):
+        sweep(images, read.cameras, torch.tensor([1.0, 2.0]))
+    with pytest.raises(OptionError, match=r"min_views must lie in 2\.\.5"):
+        sweep(images, read.cameras, torch.tensor([1.0, 2.0, 3.0]), min_views=6)

@@ -6,21 +6,19 @@ The matrices are composed in float64. Nothing below this module knows cameras or
 from __future__ import annotations
 
 import torch
-from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from lsmgeo._checks import check_devices, check_float, check_mask, check_size, describe
 from lsmgeo._linalg import affine_inverse, multiply
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
-from lsmgeo.cameras.tensors import CameraTensors, as_tensors, check_cameras, image_sizes
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, check_cameras, image_sizes
 from lsmgeo.cameras.transforms import common_size
 from lsmgeo.errors import DTypeError, ShapeError
 from lsmgeo.grids import FrustumGrid, Lattice, VoxelGrid, check_depths
 from lsmgeo.kernels.request import Options, Sites
 
-__all__ = ["check_features", "direction_matrix", "image_matrices", "image_sites", "sweep_sites"]
+__all__ = ["Cameras", "Grid", "check_features", "direction_matrix", "image_matrices", "image_sites", "sweep_sites"]
 
-Cameras = PinholeCamera | CameraTensors
 Grid = VoxelGrid | FrustumGrid
 
 

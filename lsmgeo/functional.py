@@ -410,14 +410,14 @@ def view_statistics(volume: Tensor, visible: Tensor, statistics: Names, view_mas
     """Mean, population variance or maximum over the views that see a site; what `unproject` does with `reduce`.
 
     Args:
-        volume: (B, V, C, *sites).
-        visible: (B, V, *sites) bool.
+        volume: (B, V, C, ...) with any axes of sites.
+        visible: (B, V, ...) bool.
         statistics: "mean", "variance" (mean of squares about the mean), "max" (its gradient goes to the first view that
             attains it), or several.
         view_mask: (B, V) bool; views where it is False do not count.
 
     Returns:
-        (B, C'', *sites): blocks of C channels in the order asked; 0 where no view sees the site.
+        (B, C'', ...): blocks of C channels in the order asked; 0 where no view sees the site.
 
     Raises:
         ShapeError, DTypeError, DeviceError, OptionError: see `lsmgeo.errors`.

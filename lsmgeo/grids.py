@@ -12,13 +12,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from lsmgeo._checks import check_choice, check_devices, check_float, check_number, check_size, describe
 from lsmgeo._linalg import affine_inverse, inverse_3x3, multiply
 from lsmgeo.cameras.matrices import camera_matrices
-from lsmgeo.cameras.tensors import CAMERA_DTYPES, CameraTensors, as_tensors, check_cameras
+from lsmgeo.cameras.tensors import CAMERA_DTYPES, Cameras, as_tensors, check_cameras
 from lsmgeo.cameras.transforms import common_size
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
@@ -218,7 +217,7 @@ class FrustumGrid:
                 [-1.,  0.,  0.]])
     """
 
-    camera: PinholeCamera | CameraTensors
+    camera: Cameras
     depths: Tensor
     size: tuple[int, int] | None = None
 
@@ -281,7 +280,7 @@ def depth_planes(near: float | Tensor, far: float | Tensor, num: int, spacing: s
     """Depths of sweep planes from near to far, both ends included.
 
     Equation: with a in [0, 1] evenly spaced, "depth": near + a (far - near); "inverse":
-    1 / (1/near + a (1/far - 1/near)); "log": near (far / near)^a. "inverse" moves a sample by even steps in another view.
+    1 / (1/near + a (1/far - 1/near)); "log": near (far / near)^a. "inverse" makes even steps in another view.
 
     Args:
         near: first depth, positive, world units; a number, or (B,) for depths of each scene.

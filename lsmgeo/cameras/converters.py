@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import (
     axis_angle_to_rotation_matrix,
     quaternion_to_rotation_matrix,
@@ -20,7 +19,7 @@ from torch import Tensor
 
 from lsmgeo._checks import check_choice, check_float
 from lsmgeo._linalg import homogeneous_row, transform
-from lsmgeo.cameras.tensors import CAMERA_DTYPES, CameraTensors, as_tensors, check_cameras
+from lsmgeo.cameras.tensors import CAMERA_DTYPES, Cameras, CameraTensors, as_tensors, check_cameras
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, ShapeError
 
@@ -99,7 +98,7 @@ def _made(who: str, K: Tensor, R: Tensor, t: Tensor, height: Size, width: Size, 
     return cameras
 
 
-def _taken(who: str, cameras: PinholeCamera | CameraTensors, pixel_center: str) -> tuple[Tensor, Tensor, Tensor]:
+def _taken(who: str, cameras: Cameras, pixel_center: str) -> tuple[Tensor, Tensor, Tensor]:
     check_choice(who, "pixel_center", pixel_center, PIXEL_CENTERS)
     tensors = as_tensors(cameras, who)
     check_cameras(who, tensors)
@@ -151,7 +150,7 @@ def from_opencv(
     return _made(who, K, R, _matrix(who, "translation", translation, 3), height, width, pixel_center)
 
 
-def to_opencv(cameras: PinholeCamera | CameraTensors, *, pixel_center: str = "integer") -> OpenCVCameras:
+def to_opencv(cameras: Cameras, *, pixel_center: str = "integer") -> OpenCVCameras:
     """Inverse of `from_opencv`: intrinsics, rotation matrices (``cv2.Rodrigues`` gives rvec) and translations.
 
     Args:
@@ -205,7 +204,7 @@ def from_opengl(
     return _made(who, K, R, 0.0 - transform(R, pose[..., :3, 3]), height, width, pixel_center)
 
 
-def to_opengl(cameras: PinholeCamera | CameraTensors, *, pixel_center: str = "half") -> OpenGLCameras:
+def to_opengl(cameras: Cameras, *, pixel_center: str = "half") -> OpenGLCameras:
     """Inverse of `from_opengl`.
 
     Args:
@@ -269,7 +268,7 @@ def from_colmap(
     return _made(who, K, R, _matrix(who, "translation", translation, 3), height, width, pixel_center)
 
 
-def to_colmap(cameras: PinholeCamera | CameraTensors, *, pixel_center: str = "half") -> ColmapCameras:
+def to_colmap(cameras: Cameras, *, pixel_center: str = "half") -> ColmapCameras:
     """Inverse of `from_colmap`; the quaternion's sign is free.
 
     Args:
@@ -346,7 +345,7 @@ def from_pytorch3d(
     return _made(who, K, flip[:, None] * R.transpose(-1, -2) + 0.0, flip * T, height, width, "half")
 
 
-def to_pytorch3d(cameras: PinholeCamera | CameraTensors, *, in_ndc: bool = True) -> PyTorch3DCameras:
+def to_pytorch3d(cameras: Cameras, *, in_ndc: bool = True) -> PyTorch3DCameras:
     """Inverse of `from_pytorch3d`.
 
     Args:

@@ -14,7 +14,7 @@ from lsmgeo._linalg import multiply
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, DTypeError, ShapeError
 
-__all__ = ["CameraTensors", "as_tensors", "check_cameras", "image_sizes", "stack", "to"]
+__all__ = ["CameraTensors", "Cameras", "as_tensors", "check_cameras", "image_sizes", "stack", "to"]
 
 CAMERA_DTYPES = (torch.float32, torch.float64)
 
@@ -67,7 +67,10 @@ class CameraTensors(NamedTuple):
         )
 
 
-def as_tensors(cameras: PinholeCamera | CameraTensors, who: str = "cameras") -> CameraTensors:
+Cameras = PinholeCamera | CameraTensors
+
+
+def as_tensors(cameras: Cameras, who: str = "cameras") -> CameraTensors:
     """Bring any accepted form of cameras to `CameraTensors` with 3x3 intrinsics and sizes as tensors.
 
     Args:
@@ -189,7 +192,7 @@ def check_cameras(who: str, cameras: CameraTensors, view_mask: Tensor | None = N
                 raise CameraError(f"{who}: cameras{list(index) if index else ''}: {text}{came}")
 
 
-def stack(cameras: Sequence[PinholeCamera | CameraTensors], dim: int = 0) -> CameraTensors:
+def stack(cameras: Sequence[Cameras], dim: int = 0) -> CameraTensors:
     """Stack cameras of equal leading shape along a new leading axis, as ``torch.stack`` does.
 
     Args:
@@ -221,7 +224,7 @@ def stack(cameras: Sequence[PinholeCamera | CameraTensors], dim: int = 0) -> Cam
     return CameraTensors(*fields)
 
 
-def to(cameras: PinholeCamera | CameraTensors, *args: Any, **kwargs: Any) -> CameraTensors:
+def to(cameras: Cameras, *args: Any, **kwargs: Any) -> CameraTensors:
     """Move cameras to a device or dtype; the arguments are those of ``torch.Tensor.to``.
 
     Sizes follow the device and keep their dtype.

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from lsmgeo._checks import check_float, check_number, check_size
 from lsmgeo._linalg import cross, homogeneous_row, inverse_3x3, multiply, transform
 from lsmgeo.cameras.matrices import resize_matrix
-from lsmgeo.cameras.tensors import CAMERA_DTYPES, CameraTensors, as_tensors, check_cameras, image_sizes
+from lsmgeo.cameras.tensors import CAMERA_DTYPES, Cameras, CameraTensors, as_tensors, check_cameras, image_sizes
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, OptionError, ShapeError
 
@@ -21,7 +20,7 @@ __all__ = ["crop", "look_at", "orbit", "perturb", "rays", "resize"]
 Vector = Tensor | Sequence[float]
 
 
-def resize(cameras: PinholeCamera | CameraTensors, height: int, width: int) -> CameraTensors:
+def resize(cameras: Cameras, height: int, width: int) -> CameraTensors:
     """The cameras of the same images resized to (height, width).
 
     Equation: with sx = width'/width, fx' = fx sx, skew' = skew sx, cx' = (cx + 0.5) sx - 0.5; the same in y.
@@ -61,9 +60,7 @@ def resize(cameras: PinholeCamera | CameraTensors, height: int, width: int) -> C
     )
 
 
-def crop(
-    cameras: PinholeCamera | CameraTensors, top: int | Tensor, left: int | Tensor, height: int, width: int
-) -> CameraTensors:
+def crop(cameras: Cameras, top: int | Tensor, left: int | Tensor, height: int, width: int) -> CameraTensors:
     """The cameras of windows cut out of the same images (or of padded images, where top or left is negative).
 
     Equation: cx' = cx - left, cy' = cy - top.
@@ -222,7 +219,7 @@ def orbit(
 
 
 def perturb(
-    cameras: PinholeCamera | CameraTensors,
+    cameras: Cameras,
     degrees: float,
     *,
     target: Vector = (0.0, 0.0, 0.0),
@@ -271,7 +268,7 @@ def perturb(
     return tensors._replace(cam_from_world=homogeneous_row(rows))
 
 
-def rays(cameras: PinholeCamera | CameraTensors, size: tuple[int, int] | None = None) -> tuple[Tensor, Tensor]:
+def rays(cameras: Cameras, size: tuple[int, int] | None = None) -> tuple[Tensor, Tensor]:
     """The ray of every pixel, in the world.
 
     Equation: C = -R^T t, d = normalize(R^T K^-1 (u, v, 1)) at integer (u, v).

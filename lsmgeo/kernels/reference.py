@@ -6,15 +6,15 @@ This module alone knows `grid_sample` and its `align_corners`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import reduce
+from functools import partial, reduce
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
-from torch.utils.checkpoint import checkpoint
 
 from lsmgeo.debugging import is_traced
+from lsmgeo.kernels.recompute import recomputed
 from lsmgeo.kernels.request import Options, Sites
 from lsmgeo.kernels.statistics import view_statistics
 
@@ -256,27 +256,29 @@ def _sample_through_cameras(
 
 
 def _over_pieces(
-    piece: Callable[[int, int], tuple[Tensor, Tensor]], total: int, options: Options, views: int, dtype: torch.dtype
+    piece: Callable[..., tuple[Tensor, Tensor]],
+    total: int,
+    inputs: Sequence[Tensor | None],
+    options: Options,
+    dtype: torch.dtype,
 ) -> tuple[Tensor, Tensor]:
-    """Statistics over the views of `piece(start, stop)`, one piece of the sites' first axis after another.
+    """Statistics over the views of `piece(start, stop, *inputs)`, one piece of the sites' first axis after another.
 
     The values of all views exist for one piece at a time; in backward they are made again.
     """
 
-    def reduced(start: int, stop: int) -> tuple[Tensor, Tensor]:
-        values, visible = piece(start, stop)
+    def reduced(start: int, stop: int, *inputs: Tensor | None) -> tuple[Tensor, Tensor]:
+        values, visible = piece(start, stop, *inputs)
         return _cast(view_statistics(values, visible, options.reduce), dtype), visible
 
     if is_traced():  # no loop whose length depends on a size, no recomputation by hand
-        return reduced(0, total)
-    step = max(1, -(-total // max(1, views)))
-    pieces = []
-    for start in range(0, max(1, total), step):
-        stop = min(start + step, total)
-        if torch.is_grad_enabled():
-            pieces.append(checkpoint(reduced, start, stop, use_reentrant=False, preserve_rng_state=False))
-        else:
-            pieces.append(reduced(start, stop))
+        return reduced(0, total, *inputs)
+    views = inputs[0].shape[1]  # type: ignore[union-attr]
+    step = max(1, -(-total // views))
+    pieces = [
+        recomputed(partial(reduced, start, min(start + step, total)), *inputs)
+        for start in range(0, max(1, total), step)
+    ]
     return torch.cat([values for values, _ in pieces], 2), torch.cat([visible for _, visible in pieces], 2)
 
 
@@ -292,18 +294,20 @@ def unproject(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, T
     dtype, output = _computing_dtype(source), source.dtype
     source = source.to(dtype)
     scale = _scale_below_overflow(_lattice_extent(sites.matrix, sites))[..., None]  # (B, V, 1)
-    matrix = sites.matrix * scale[..., None]  # homogeneous: a factor moves no pixel
 
-    def piece(start: int, stop: int) -> tuple[Tensor, Tensor]:
-        part = sites.slab(start, stop)
+    def piece(
+        start: int, stop: int, source: Tensor, matrix: Tensor, direction: Tensor | None, z: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        matrix = matrix * scale[..., None]  # homogeneous: a factor moves no pixel
+        part = sites._replace(matrix=matrix, direction=direction, z=z).slab(start, stop)
         unit = (_per_view(part.z, matrix) * scale if part.projective else scale).to(dtype)[..., None, None]
         rows = _lattice_rows(matrix, part, dtype)
         values, visible, depth = _sample_through_cameras(source, rows, unit, part.view_mask, options)
-        direction = _lattice_directions(part, dtype) if options.direction else None
-        return _output(values, depth, direction, dtype if options.reduce else output), visible
+        vectors = _lattice_directions(part, dtype) if options.direction else None
+        return _output(values, depth, vectors, dtype if options.reduce else output), visible
 
-    total = sites.z.shape[-1]
-    return _over_pieces(piece, total, options, source.shape[1], output) if options.reduce else piece(0, total)
+    total, inputs = sites.z.shape[-1], (source, sites.matrix, sites.direction, sites.z)
+    return _over_pieces(piece, total, inputs, options, output) if options.reduce else piece(0, total, *inputs)
 
 
 def unproject_points(
@@ -317,19 +321,19 @@ def unproject_points(
     dtype, output = _computing_dtype(source), source.dtype
     source = source.to(dtype)
     scale = _scale_below_overflow(_point_extent(matrix, points))[..., None]  # (B, V, 1)
-    scaled = matrix * scale[..., None]
 
-    def piece(start: int, stop: int) -> tuple[Tensor, Tensor]:
-        part = points[:, start:stop]
-        rows = _point_rows(scaled, part, dtype)
+    def piece(
+        start: int, stop: int, source: Tensor, matrix: Tensor, direction: Tensor | None, points: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        rows = _point_rows(matrix * scale[..., None], points[:, start:stop], dtype)
         values, visible, depth = _sample_through_cameras(source, rows, scale.to(dtype), view_mask, options)
         vectors = None
         if direction is not None:
             vectors = _point_directions(direction, points, slice(start, stop), view_mask, dtype)
         return _output(values, depth, vectors, dtype if options.reduce else output), visible
 
-    total = points.shape[1]
-    return _over_pieces(piece, total, options, source.shape[1], output) if options.reduce else piece(0, total)
+    total, inputs = points.shape[1], (source, matrix, direction, points)
+    return _over_pieces(piece, total, inputs, options, output) if options.reduce else piece(0, total, *inputs)
 
 
 def sample_views(
@@ -343,7 +347,7 @@ def sample_views(
     dtype, output = _computing_dtype(source), source.dtype
     source = source.to(dtype)
 
-    def piece(start: int, stop: int) -> tuple[Tensor, Tensor]:
+    def piece(start: int, stop: int, source: Tensor, pixels: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
         part = slice(start, stop)
         distance, domain = depth[..., part].to(dtype), valid[..., part]
         front = domain & (distance > options.near)
@@ -352,8 +356,8 @@ def sample_views(
         distance = torch.where(domain, distance, 0.0)
         return _output(values, distance if options.depth else None, None, dtype if options.reduce else output), visible
 
-    total = pixels.shape[2]
-    return _over_pieces(piece, total, options, source.shape[1], output) if options.reduce else piece(0, total)
+    total, inputs = pixels.shape[2], (source, pixels, depth)
+    return _over_pieces(piece, total, inputs, options, output) if options.reduce else piece(0, total, *inputs)
 
 
 def _sweep(source: Tensor, sites: Sites, options: Options, output: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -401,23 +405,24 @@ def project_reduce(source: Tensor, sites: Sites, weight: Tensor, options: Option
     total = sites.z.shape[-1]
     step = max(1, min(total // 8, 256 // max(1, weight.shape[1])))
 
-    def piece(start: int, stop: int) -> tuple[Tensor, Tensor]:
-        maps, visible = _sweep(volume, sites.slab(start, stop), options, dtype)
+    def piece(
+        start: int, stop: int, volume: Tensor, matrix: Tensor, direction: Tensor | None, z: Tensor, weight: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        part = sites._replace(matrix=matrix, direction=direction, z=z).slab(start, stop)
+        maps, visible = _sweep(volume, part, options, dtype)
         stacked = maps.flatten(2, 3).flatten(3, 4)  # (B, V, C' p, h w)
-        part = torch.matmul(weight[:, :, start:stop].flatten(1).to(dtype), stacked)
-        return part.to(dtype).unflatten(3, maps.shape[-2:]), visible
+        with torch.autocast(maps.device.type, enabled=False):
+            mapped = torch.matmul(weight[:, :, start:stop].flatten(1).to(dtype), stacked)
+        return mapped.unflatten(3, maps.shape[-2:]), visible
 
-    total_map, seen = None, []
-    for start in range(0, total, step):
-        stop = min(start + step, total)
-        if torch.is_grad_enabled() and not is_traced():
-            part, visible = checkpoint(piece, start, stop, use_reentrant=False, preserve_rng_state=False)
-        else:
-            part, visible = piece(start, stop)
-        total_map = part if total_map is None else total_map + part
+    inputs = (volume, sites.matrix, sites.direction, sites.z, weight)
+    maps, visible = recomputed(partial(piece, 0, min(step, total)), *inputs)
+    seen = [visible]
+    for start in range(step, total, step):
+        part, visible = recomputed(partial(piece, start, min(start + step, total)), *inputs)
+        maps = maps + part
         seen.append(visible)
-    assert total_map is not None
-    return _cast(total_map, source.dtype), torch.cat(seen, 2)
+    return _cast(maps, source.dtype), torch.cat(seen, 2)
 
 
 OPERATORS: dict[str, Callable[..., Any]] = {

@@ -1,0 +1,181 @@
+"""Who may import whom, read from the source."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import io
+import subprocess
+import sys
+import tokenize
+from pathlib import Path
+
+import pytest
+
+import lsmgeo
+
+PACKAGE = Path(lsmgeo.__file__).parent
+MODULES = {
+    ".".join(("lsmgeo", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__"): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
+
+# Layers of the core, lowest first; a layer's modules import those named, and no others of the library.
+SHARED = {"errors", "_checks", "_linalg", "debugging"}
+MAY_IMPORT = {
+    "errors": set(),
+    "_checks": {"errors"},
+    "_linalg": set(),
+    "debugging": set(),
+    "cameras": SHARED | {"cameras"},
+    "grids": SHARED | {"cameras"},
+    "kernels": {"errors", "_checks", "debugging", "kernels"},
+    "_sites": SHARED | {"cameras", "grids", "kernels"},
+    "functional": SHARED | {"cameras", "grids", "kernels", "_sites"},
+    "layers": SHARED | {"functional", "grids", "kernels", "_sites"},
+    "fusion": SHARED | {"functional", "kernels"},
+    "rays": SHARED | {"functional", "grids", "kernels", "_sites"},
+}
+OUTSIDE_THE_CORE = {"models", "data", "classical", "scenes", "metrics", "cli", "demo"}
+HEAVY = {"cv2", "trimesh", "skimage", "matplotlib", "jsonargparse", "triton", "scipy", "tqdm", "PIL"}
+
+
+def imported(path: Path, module: str, source: str | None = None) -> set[str]:
+    """Absolute names of everything that a file imports, with ``from a import b`` as a.b if that is a module."""
+    names = set()
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8") if source is None else source)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".")
+            base = ".".join(parts[: len(parts) - node.level + 1]) if node.level else ""
+            origin = ".".join(filter(None, (base, node.module)))
+            for alias in node.names:
+                full = f"{origin}.{alias.name}"
+                names.add(full if full in MODULES else origin)
+    return names
+
+
+def part(module: str) -> str:
+    """The part of the library that a module belongs to: "cameras" for lsmgeo.cameras.tensors, "" for lsmgeo itself."""
+    return ".".join(module.split(".")[1:2])
+
+
+def core_modules() -> list[str]:
+    return [module for module in MODULES if part(module) in MAY_IMPORT]
+
+
+def violations(module: str, names: set[str]) -> set[str]:
+    own = {part(name) for name in names if name.split(".")[0] == "lsmgeo"}
+    return own - MAY_IMPORT[part(module)] - {part(module)}
+
+
+def test_every_module_has_its_place():
+    parts = {part(module) for module in MODULES} - {""}
+    assert parts <= set(MAY_IMPORT) | OUTSIDE_THE_CORE, "give the new module a place in this table"
+    assert set(MAY_IMPORT) <= parts
+
+
+@pytest.mark.parametrize("module", core_modules())
+def test_the_core_imports_along_the_arrows(module):
+    names = imported(MODULES[module], module)
+    assert violations(module, names) == set()
+    assert {name.split(".")[0] for name in names} & HEAVY == set()
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_only_the_program_imports_the_command_line(module):
+    if part(module) not in ("cli", ""):
+        assert not any(part(name) == "cli" for name in imported(MODULES[module], module) if name.startswith("lsmgeo"))
+
+
+def test_the_front_page_imports_the_core_alone():
+    names = imported(MODULES["lsmgeo"], "lsmgeo")
+    assert {part(name) for name in names} - {""} <= set(MAY_IMPORT)
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "found"),
+    [
+        ("lsmgeo.cameras.tensors", "from lsmgeo.grids import VoxelGrid", {"grids"}),
+        ("lsmgeo.grids", "import lsmgeo.kernels.reference", {"kernels"}),
+        ("lsmgeo.kernels.reference", "def f():\n    from lsmgeo import cameras", {"cameras"}),
+        ("lsmgeo.kernels.reference", "from ..grids import VoxelGrid", {"grids"}),
+        ("lsmgeo.functional", "from lsmgeo import data", {"data"}),
+        ("lsmgeo.layers", "from lsmgeo.functional import unproject", set()),
+    ],
+)
+def test_the_arrows_are_noticed(module, source, found):
+    path = MODULES[module]
+    assert violations(module, imported(path, module, source)) == found
+
+
+def names_in(path: Path) -> set[str]:
+    """All names in a file's code: identifiers and attributes, no comments, no strings."""
+    tokens = tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline)
+    return {token.string for token in tokens if token.type == tokenize.NAME}
+
+
+def test_one_module_knows_grid_sample():
+    knowing = {
+        module for module, path in MODULES.items() if names_in(path) & {"grid_sample", "affine_grid", "align_corners"}
+    }
+    assert knowing == {"lsmgeo.kernels.reference"}
+
+
+def test_only_cameras_know_the_camera_classes_of_kornia():
+    classes = {"PinholeCamera", "PinholeCamerasList"}
+    knowing = {part(module) for module, path in MODULES.items() if names_in(path) & classes}
+    assert knowing - OUTSIDE_THE_CORE == {"cameras"}
+
+
+def test_kernels_know_no_kornia():
+    for module in core_modules():
+        if part(module) not in ("cameras",):
+            assert not any(name.startswith("kornia") for name in imported(MODULES[module], module)), module
+
+
+@pytest.mark.parametrize(
+    "module", [module for module in core_modules() if part(module) in ("cameras", "grids", "_linalg", "_sites")]
+)
+def test_geometry_is_elementwise(module):
+    path = MODULES[module]
+    assert names_in(path) & {"matmul", "einsum", "bmm", "mm", "mv", "tensordot", "baddbmm", "inv", "solve"} == set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        assert not (isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.MatMult)), node.lineno
+
+
+def loaded_by(code: str) -> set[str]:
+    """Names of the modules that a fresh interpreter has loaded after the code."""
+    command = [sys.executable, "-c", f"{code}\nimport sys\nprint(*sorted(sys.modules))"]
+    return set(subprocess.run(command, capture_output=True, text=True, check=True, cwd=PACKAGE.parent).stdout.split())
+
+
+def test_the_import_is_light():
+    theirs = loaded_by("import torch, kornia.geometry")
+    ours = loaded_by("import lsmgeo")
+    assert "lsmgeo.kernels.reference" in ours
+    new = {name.split(".")[0] for name in ours - theirs}
+    assert new & HEAVY == set()
+    assert {part(name) for name in ours if name.startswith("lsmgeo.")} <= set(MAY_IMPORT)
+
+
+def test_no_test_asserts_a_time():
+    """Timings belong to the benchmarks: on a busy machine a test of one fails for no reason."""
+    clocks = {"perf_counter", "perf_counter_ns", "process_time", "monotonic", "monotonic_ns", "timeit"}
+    clocked = []
+    for path in sorted(Path(__file__).parents[1].rglob("test_*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            used = {item.attr for item in ast.walk(node) if isinstance(item, ast.Attribute)}
+            used |= {item.id for item in ast.walk(node) if isinstance(item, ast.Name)}
+            if isinstance(node, ast.FunctionDef) and used & clocks:
+                clocked.append(f"{path.name}:{node.lineno}")
+    assert clocked == []
+
+
+@pytest.mark.parametrize("module", core_modules())
+def test_every_exported_name_exists(module):
+    loaded = importlib.import_module(module)
+    for name in getattr(loaded, "__all__", []):
+        assert hasattr(loaded, name), name

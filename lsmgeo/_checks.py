@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from math import prod
 from numbers import Real
 from typing import Any
 
@@ -11,9 +12,24 @@ from torch import Tensor
 
 from lsmgeo.errors import DeviceError, DTypeError, OptionError, ShapeError
 
-__all__ = ["check_choice", "check_choices", "check_devices", "check_float", "check_mask", "check_number", "check_size"]
+__all__ = [
+    "LARGEST_COUNT",
+    "check_broadcast",
+    "check_choice",
+    "check_choices",
+    "check_devices",
+    "check_flag",
+    "check_float",
+    "check_geometry",
+    "check_mask",
+    "check_number",
+    "check_size",
+    "moved",
+]
 
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+GEOMETRY = (torch.float32, torch.float64)
+LARGEST_COUNT = 2**31 - 1
 
 
 def describe(value: Any) -> str:
@@ -37,6 +53,20 @@ def check_float(
         raise DTypeError(f"{who}: {name} must be a dense tensor; got layout {value.layout}")
     if rank is not None and value.dim() != rank:
         raise ShapeError(f"{who}: {name} must be {expected}; got {tuple(value.shape)}")
+
+
+def check_geometry(
+    who: str,
+    name: str,
+    value: Any,
+    expected: str,
+    rank: int | None = None,
+    dtypes: Sequence[torch.dtype] = GEOMETRY,
+) -> None:
+    """Require a float32 or float64 tensor of no absurd size: cameras, poses, depths, points."""
+    check_float(who, name, value, expected, rank, dtypes)
+    if value.numel() > LARGEST_COUNT:
+        raise ShapeError(f"{who}: {name} must be {expected}, 2^31 - 1 numbers at most; got {tuple(value.shape)}")
 
 
 def check_mask(who: str, name: str, value: Any, shape: tuple[int, ...], expected: str) -> None:
@@ -66,6 +96,22 @@ def check_choices(who: str, name: str, value: Any, choices: Sequence[str]) -> tu
     return names
 
 
+def check_flag(who: str, name: str, value: Any) -> bool:
+    """Require True or False."""
+    if not isinstance(value, bool):
+        raise OptionError(f"{who}: {name} must be True or False; got {describe(value)}")
+    return value
+
+
+def check_broadcast(who: str, **shapes: Sequence[int]) -> tuple[int, ...]:
+    """Require leading shapes that broadcast, and return the one that comes of it."""
+    try:
+        return tuple(torch.broadcast_shapes(*(tuple(shape) for shape in shapes.values())))
+    except RuntimeError:
+        came = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
+        raise ShapeError(f"{who}: leading shapes must broadcast; got {came}") from None
+
+
 def check_number(who: str, name: str, value: Any, expected: str) -> float:
     """Require a finite real number."""
     if not isinstance(value, Real) or isinstance(value, bool) or not abs(float(value)) < float("inf"):
@@ -86,6 +132,8 @@ def check_size(who: str, name: str, value: Any, length: int, expected: str) -> t
         raise ShapeError(f"{who}: {name} must be {expected}; got {describe(value)}")
     if any(item < 1 for item in value):
         raise ShapeError(f"{who}: {name} must be {expected}, each at least 1; got {tuple(value)}")
+    if prod(value) > LARGEST_COUNT:
+        raise ShapeError(f"{who}: {name} must be {expected}, 2^31 - 1 cells at most; got {tuple(value)}")
     return tuple(value)
 
 
@@ -95,3 +143,10 @@ def check_devices(who: str, **tensors: Tensor | None) -> None:
     if len(set(given.values())) > 1:
         places = ", ".join(f"{name} on {device}" for name, device in given.items())
         raise DeviceError(f"{who}: all tensors must be on one device; got {places}")
+
+
+def moved(who: str, name: str, tensor: Tensor, device: torch.device) -> Tensor:
+    """A tensor on another device; one on the meta device holds nothing to move."""
+    if tensor.is_meta and device.type != "meta":
+        raise DeviceError(f"{who}: {name} must hold values; got a tensor on the meta device")
+    return tensor.to(device)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lsmgeo import kernels
-from lsmgeo._checks import check_choices, check_devices, check_float, check_mask, describe
+from lsmgeo._checks import check_choices, check_devices, check_flag, check_float, check_geometry, check_mask, describe
 from lsmgeo._sites import Cameras, Grid, check_features, direction_matrix, image_matrices, image_sites, sweep_sites
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import GridError, OptionError, ShapeError
@@ -250,7 +250,7 @@ def unproject_points(
     )
     kernels.check_backend(who, backend)
     matrices = image_matrices(who, features, cameras, view_mask)
-    check_float(who, "points", points, "(B, N, 3)", rank=3, dtypes=(torch.float32, torch.float64))
+    check_geometry(who, "points", points, "(B, N, 3)", rank=3)
     if points.shape[0] != features.shape[0] or points.shape[2] != 3:
         raise ShapeError(f"{who}: points must be (B, N, 3) with B = {features.shape[0]}; got {tuple(points.shape)}")
     check_devices(who, features=features, points=points)
@@ -314,10 +314,10 @@ def sample_views(
         raise OptionError(f"{who}: augment must be 'depth' or nothing, a direction needs a camera; got {augment!r}")
     kernels.check_backend(who, backend)
     views = check_features(who, features)
-    check_float(who, "pixels", pixels, "(B, V, N, 2)", rank=4, dtypes=(torch.float32, torch.float64))
+    check_geometry(who, "pixels", pixels, "(B, V, N, 2)", rank=4)
     if tuple(pixels.shape[:2]) != views or pixels.shape[3] != 2:
         raise ShapeError(f"{who}: pixels must be (B, V, N, 2) with (B, V) = {views}; got {tuple(pixels.shape)}")
-    check_float(who, "depth", depth, "(B, V, N)", rank=3, dtypes=(pixels.dtype,))
+    check_geometry(who, "depth", depth, "(B, V, N)", rank=3, dtypes=(pixels.dtype,))
     if depth.shape != pixels.shape[:3]:
         raise ShapeError(f"{who}: depth must be (B, V, N) = {tuple(pixels.shape[:3])}; got {tuple(depth.shape)}")
     check_mask(who, "valid", valid, tuple(pixels.shape[:3]), "(B, V, N)")
@@ -399,8 +399,7 @@ def plane_sweep_project(
         near=near,
     )
     kernels.check_backend(who, backend)
-    if not isinstance(flatten, bool):
-        raise OptionError(f"{who}: flatten must be True or False; got {describe(flatten)}")
+    check_flag(who, "flatten", flatten)
     sites = sweep_sites(who, volume, cameras, grid, depths, size, view_mask, options)
     maps, visible = kernels.run("plane_sweep_project", volume, sites, options=options, backend=backend)
     return Projected(maps.flatten(2, 3) if flatten else maps, visible)
@@ -440,8 +439,9 @@ def view_statistics(volume: Tensor, visible: Tensor, statistics: Names, view_mas
     check_mask(who, "visible", visible, (*volume.shape[:2], *volume.shape[3:]), "(B, V, ...)")
     if view_mask is not None:
         check_mask(who, "view_mask", view_mask, tuple(volume.shape[:2]), "(B, V)")
-        visible = visible & view_mask.reshape(*view_mask.shape, *(1,) * (visible.dim() - 2))
     check_devices(who, volume=volume, visible=visible, view_mask=view_mask)
+    if view_mask is not None:
+        visible = visible & view_mask.reshape(*view_mask.shape, *(1,) * (visible.dim() - 2))
     computing = volume if volume.dtype == torch.float64 else volume.float()
     largest = torch.finfo(volume.dtype).max
     return _view_statistics(computing, visible, names).clamp(-largest, largest).to(volume.dtype)

@@ -14,15 +14,28 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_choice, check_devices, check_float, check_number, check_size, describe
+from lsmgeo._checks import (
+    check_choice,
+    check_devices,
+    check_geometry,
+    check_number,
+    check_size,
+    describe,
+    moved,
+)
 from lsmgeo._linalg import affine_inverse, inverse_3x3, multiply
 from lsmgeo.cameras.matrices import camera_matrices
-from lsmgeo.cameras.tensors import CAMERA_DTYPES, Cameras, as_tensors, check_cameras
+from lsmgeo.cameras.tensors import Cameras, as_tensors, check_cameras
 from lsmgeo.cameras.transforms import common_size
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
 
 __all__ = ["FrustumGrid", "Lattice", "VoxelGrid", "depth_planes"]
+
+
+# Far from what float32 holds.
+LARGEST_BOUND = 1e37
+LARGEST_NUMBER_OF_PLANES = 2**20
 
 
 class Lattice(NamedTuple):
@@ -36,7 +49,8 @@ class Lattice(NamedTuple):
 
     def to(self, device: torch.device) -> Lattice:
         """The same lattice on another device."""
-        return self._replace(**{name: getattr(self, name).to(device) for name in self._fields[:4]})
+        T, x, y, z = (moved("grid", name, tensor, device) for name, tensor in zip("Txyz", self[:4], strict=True))
+        return Lattice(T, x, y, z, self.projective)
 
     def centers(self) -> Tensor:
         """World positions of the sites, (D, H, W, 3) or (B, D, H, W, 3)."""
@@ -92,18 +106,22 @@ class VoxelGrid:
         matrix = self.world_from_grid
         if matrix is None:
             return
-        check_float("VoxelGrid", "world_from_grid", matrix, "(4, 4) or (B, 4, 4)", dtypes=CAMERA_DTYPES)
+        check_geometry("VoxelGrid", "world_from_grid", matrix, "(4, 4) or (B, 4, 4)")
         if matrix.dim() not in (2, 3) or tuple(matrix.shape[-2:]) != (4, 4):
             raise ShapeError(f"VoxelGrid: world_from_grid must be (4, 4) or (B, 4, 4); got {tuple(matrix.shape)}")
         if can_inspect(matrix):
             with torch.no_grad():
                 double = matrix.double()
                 if not bool(double.isfinite().all()):
-                    raise GridError("VoxelGrid: world_from_grid must be finite")
-                if not bool(((double[..., 3, :] - double.new_tensor([0.0, 0.0, 0.0, 1.0])).abs() <= 1e-3).all()):
-                    raise GridError("VoxelGrid: world_from_grid must be affine, its last row (0, 0, 0, 1)")
+                    raise GridError("VoxelGrid: world_from_grid must be finite; got a NaN or an infinity")
+                off = (double[..., 3, :] - double.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax(-1)
+                if not bool((off <= 1e-3).all()):
+                    raise GridError(
+                        "VoxelGrid: world_from_grid must be affine, its last row (0, 0, 0, 1); "
+                        f"got one that differs by {off.max().item():.6g}"
+                    )
                 if not bool(inverse_3x3(double[..., :3, :3]).isfinite().all()):
-                    raise GridError("VoxelGrid: world_from_grid must be invertible")
+                    raise GridError("VoxelGrid: world_from_grid must be invertible; got a singular matrix")
 
     def __repr__(self) -> str:
         """The call that makes this grid (a matrix is shown by its shape)."""
@@ -152,8 +170,6 @@ def _grid_shape(who: str, value: object) -> tuple[int, int, int]:
         depth, height, width = check_size(who, "shape", value, 3, "an int or (D, H, W)")
     except ShapeError as error:
         raise GridError(str(error)) from None
-    if depth * height * width > 2**31 - 1:
-        raise GridError(f"{who}: shape must hold at most 2^31 - 1 sites; got {(depth, height, width)}")
     return depth, height, width
 
 
@@ -167,12 +183,14 @@ def _bounds(name: str, value: object) -> tuple[float, float, float]:
         x, y, z = (check_number("VoxelGrid", name, item, "a finite number or (x, y, z)") for item in values)
     except OptionError as error:
         raise GridError(str(error)) from None
+    if not max(abs(x), abs(y), abs(z)) <= LARGEST_BOUND:
+        raise GridError(f"VoxelGrid: {name} must be at most {LARGEST_BOUND:g}; got {(x, y, z)}")
     return x, y, z
 
 
 def check_depths(who: str, depths: Tensor, expected: str = "(P,) or (B, P)", view_mask: Tensor | None = None) -> None:
     """Require float32 or float64 depths, at least one, positive and strictly ascending along the last axis."""
-    check_float(who, "depths", depths, expected, dtypes=CAMERA_DTYPES)
+    check_geometry(who, "depths", depths, expected)
     if depths.dim() < 1 or depths.dim() > expected.count("(") or depths.shape[-1] < 1:
         raise ShapeError(f"{who}: depths must be {expected} with P at least 1; got {tuple(depths.shape)}")
     if not can_inspect(depths):
@@ -306,14 +324,14 @@ def depth_planes(near: float | Tensor, far: float | Tensor, num: int, spacing: s
     """
     who = "depth_planes"
     check_choice(who, "spacing", spacing, ("depth", "inverse", "log"))
-    if not isinstance(num, int) or isinstance(num, bool) or num < 1:
-        raise GridError(f"{who}: num must be an integer, at least 1; got {describe(num)}")
+    if not isinstance(num, int) or isinstance(num, bool) or not 1 <= num <= LARGEST_NUMBER_OF_PLANES:
+        raise GridError(f"{who}: num must be an integer from 1 to {LARGEST_NUMBER_OF_PLANES}; got {describe(num)}")
     given = [value for value in (near, far) if isinstance(value, Tensor)]
     like = given[0] if given else torch.zeros(())
     ends = []
     for name, value in (("near", near), ("far", far)):
         if isinstance(value, Tensor):
-            check_float(who, name, value, "a number or (B,)", dtypes=CAMERA_DTYPES)
+            check_geometry(who, name, value, "a number or (B,)")
             if value.dim() > 1:
                 raise ShapeError(f"{who}: {name} must be a number or (B,); got {tuple(value.shape)}")
         else:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from lsmgeo import functional, kernels
-from lsmgeo._checks import check_size, describe
+from lsmgeo._checks import check_flag, check_size, describe, moved
 from lsmgeo._sites import Cameras, Grid
-from lsmgeo.errors import DTypeError, GridError, OptionError
+from lsmgeo.errors import DTypeError, GridError
 from lsmgeo.functional import Names, Projected, Unprojected
 from lsmgeo.grids import FrustumGrid, VoxelGrid, check_depths
 from lsmgeo.kernels.request import Options
@@ -167,8 +167,7 @@ class PlaneSweepProject(nn.Module):
             check_depths(who, depths, "(P,), (B, P) or (B, V, P)")
         if size is not None:
             check_size(who, "size", size, 2, "(h, w)")
-        if not isinstance(flatten, bool):
-            raise OptionError(f"{who}: flatten must be True or False; got {describe(flatten)}")
+        check_flag(who, "flatten", flatten)
         kernels.check_backend(who, backend)
         Options.checked(
             who,
@@ -204,7 +203,8 @@ class PlaneSweepProject(nn.Module):
         if grid is None:
             raise GridError("PlaneSweepProject: grid must be given to the layer or to the call; got None")
         if depths is None and self.depths is not None:
-            depths = self.depths.to(volume.device) if isinstance(volume, Tensor) else self.depths
+            device = volume.device if isinstance(volume, Tensor) else self.depths.device
+            depths = moved("PlaneSweepProject", "depths", self.depths, device)
         if depths is None:
             raise GridError("PlaneSweepProject: depths must be given to the layer or to the call; got None")
         return functional.plane_sweep_project(

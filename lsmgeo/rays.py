@@ -12,9 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from lsmgeo import kernels
-from lsmgeo._checks import check_devices, check_float, describe
+from lsmgeo._checks import LARGEST_COUNT, check_broadcast, check_devices, check_flag, check_float, describe, moved
 from lsmgeo._sites import Cameras, sweep_sites
-from lsmgeo.errors import DTypeError, OptionError, ShapeError
+from lsmgeo.debugging import can_inspect
+from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
 from lsmgeo.functional import Names, Projected
 from lsmgeo.grids import VoxelGrid, check_depths
 from lsmgeo.kernels.request import Options
@@ -35,12 +36,8 @@ def _check_visible(who: str, visible: Tensor | None, planes: Tensor) -> None:
         raise DTypeError(
             f"{who}: visible must be a bool tensor that broadcasts to {tuple(planes.shape)}; got {describe(visible)}"
         )
-    try:
-        torch.broadcast_shapes(visible.shape, planes.shape)
-    except RuntimeError:
-        raise ShapeError(
-            f"{who}: visible must broadcast to {tuple(planes.shape)}; got {tuple(visible.shape)}"
-        ) from None
+    if check_broadcast(who, visible=visible.shape, planes=planes.shape) != tuple(planes.shape):
+        raise ShapeError(f"{who}: visible must broadcast to {tuple(planes.shape)}; got {tuple(visible.shape)}")
     check_devices(who, planes=planes, visible=visible)
 
 
@@ -50,6 +47,9 @@ def _along_rays(who: str, depths: Tensor, planes: Tensor) -> Tensor:
     if depths.dim() < 1 or depths.shape[-1] != planes.shape[-3]:
         raise ShapeError(f"{who}: depths must be (..., P) with P = {planes.shape[-3]}; got {tuple(depths.shape)}")
     check_devices(who, planes=planes, depths=depths)
+    check_broadcast(who, depths=depths.shape[:-1], planes=planes.shape[:-3])
+    if can_inspect(depths) and not bool(depths.isfinite().all()):
+        raise GridError(f"{who}: depths must be finite; got a NaN or an infinity")
     return depths.to(planes.dtype)[..., None, None]
 
 
@@ -83,7 +83,7 @@ def expected_depth(scores: Tensor, depths: Tensor, visible: Tensor | None = None
     planes = _along_rays(who, depths, scores)
     if visible is None:
         return (scores.softmax(-3) * planes).sum(-3)
-    seen = visible.expand(torch.broadcast_shapes(visible.shape, scores.shape))
+    seen = visible.expand(scores.shape)
     any_seen = seen.any(-3, keepdim=True)
     # Rays with no sample get even weights, which are then dropped: a softmax over nothing is NaN.
     weights = torch.where(seen | ~any_seen, scores, -torch.inf).softmax(-3)
@@ -165,6 +165,7 @@ def composite(alpha: Tensor, values: Tensor, depths: Tensor, visible: Tensor | N
         )
     if values.dtype != alpha.dtype:
         raise DTypeError(f"{who}: values must be of alpha's {alpha.dtype}; got {values.dtype}")
+    check_devices(who, alpha=alpha, values=values)
     _check_visible(who, visible, alpha)
     planes = _along_rays(who, depths, alpha)
     if visible is not None:
@@ -254,11 +255,11 @@ def project_reduce(
             f"{who}: weight must be (O, C' P) or (O, C' P, 1, 1) with C' P = {channels} * {planes}; "
             f"got {tuple(weight.shape)}"
         )
-    check_devices(who, volume=volume, weight=weight, bias=bias)
     if bias is not None:
         check_float(who, "bias", bias, "(O,)")
         if tuple(bias.shape) != (weight.shape[0],):
             raise ShapeError(f"{who}: bias must be (O,) = ({weight.shape[0]},); got {tuple(bias.shape)}")
+    check_devices(who, volume=volume, weight=weight, bias=bias)
     stacked = weight.unflatten(1, (channels, planes))
     maps, visible = kernels.run("project_reduce", volume, sites, stacked, options=options, backend=backend)
     if bias is not None:
@@ -335,6 +336,7 @@ class ProjectReduce(nn.Module):
         if not isinstance(grid, VoxelGrid):
             raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
         check_depths(who, depths, "(P,), (B, P) or (B, V, P)")
+        check_flag(who, "bias", bias)
         self.grid = grid
         self.depths = depths
         self.size = size
@@ -345,13 +347,19 @@ class ProjectReduce(nn.Module):
         self.near = near
         self.backend = backend
         channels = in_channels + bool(options.depth) + 3 * bool(options.direction)
+        if channels * depths.shape[-1] * out_channels > LARGEST_COUNT:
+            raise OptionError(
+                f"{who}: in_channels times planes times out_channels must be 2^31 - 1 at most; "
+                f"got {in_channels}, {depths.shape[-1]} and {out_channels}"
+            )
         convolution = nn.Conv2d(channels * depths.shape[-1], out_channels, 1, bias=bias)
         self.weight = convolution.weight
         self.bias = convolution.bias
 
     def forward(self, volume: Tensor, cameras: Cameras, view_mask: Tensor | None = None) -> Projected:
         """Sweep and reduce a volume (B, C, D, H, W)."""
-        depths = self.depths.to(volume.device) if isinstance(volume, Tensor) else self.depths
+        device = volume.device if isinstance(volume, Tensor) else self.depths.device
+        depths = moved("ProjectReduce", "depths", self.depths, device)
         return project_reduce(
             volume,
             cameras,

@@ -17,9 +17,9 @@ from kornia.geometry.conversions import (
 )
 from torch import Tensor
 
-from lsmgeo._checks import check_choice, check_float
+from lsmgeo._checks import check_broadcast, check_choice, check_devices, check_flag, check_geometry, check_size
 from lsmgeo._linalg import homogeneous_row, transform
-from lsmgeo.cameras.tensors import CAMERA_DTYPES, Cameras, CameraTensors, as_tensors, check_cameras
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, check_cameras, image_sizes
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, ShapeError
 
@@ -76,7 +76,7 @@ class PyTorch3DCameras(NamedTuple):
 
 def _matrix(who: str, name: str, value: Tensor, *shape: int) -> Tensor:
     expected = f"(..., {', '.join(map(str, shape))})"
-    check_float(who, name, value, expected, dtypes=CAMERA_DTYPES)
+    check_geometry(who, name, value, expected)
     if tuple(value.shape[-len(shape) :]) != shape:
         raise ShapeError(f"{who}: {name} must be {expected}; got {tuple(value.shape)}")
     return value
@@ -91,7 +91,8 @@ def _made(who: str, K: Tensor, R: Tensor, t: Tensor, height: Size, width: Size, 
     check_choice(who, "pixel_center", pixel_center, PIXEL_CENTERS)
     if pixel_center == "half":
         K = _shifted(K, -0.5)
-    leading = torch.broadcast_shapes(K.shape[:-2], R.shape[:-2], t.shape[:-1])
+    check_devices(who, intrinsics=K, rotation=R, translation=t)
+    leading = check_broadcast(who, intrinsics=K.shape[:-2], rotation=R.shape[:-2], translation=t.shape[:-1])
     rows = torch.cat((R.expand(*leading, 3, 3), t[..., None].expand(*leading, 3, 1)), -1)
     cameras = as_tensors(CameraTensors(K.expand(*leading, 3, 3), homogeneous_row(rows), height, width), who)
     check_cameras(who, cameras)
@@ -141,7 +142,7 @@ def from_opencv(
     """
     who = "from_opencv"
     K = _matrix(who, "intrinsics", intrinsics, 3, 3)
-    check_float(who, "rotation", rotation, "(..., 3) or (..., 3, 3)", dtypes=CAMERA_DTYPES)
+    check_geometry(who, "rotation", rotation, "(..., 3) or (..., 3, 3)")
     if rotation.dim() >= 2 and tuple(rotation.shape[-2:]) == (3, 3) and rotation.dim() == K.dim():
         R = rotation
     else:
@@ -329,8 +330,20 @@ def from_pytorch3d(
     """
     who = "from_pytorch3d"
     R, T = _matrix(who, "R", R, 3, 3), _matrix(who, "T", T, 3)
-    check_float(who, "focal_length", focal_length, "(..., 2) or (..., 1)", dtypes=CAMERA_DTYPES)
+    check_geometry(who, "focal_length", focal_length, "(..., 2) or (..., 1)")
     principal_point = _matrix(who, "principal_point", principal_point, 2)
+    if focal_length.dim() < 1 or focal_length.shape[-1] not in (1, 2):
+        raise ShapeError(f"{who}: focal_length must be (..., 2) or (..., 1); got {tuple(focal_length.shape)}")
+    height, width = check_size(who, "(height, width)", (height, width), 2, "two integers")
+    check_flag(who, "in_ndc", in_ndc)
+    check_devices(who, R=R, T=T, focal_length=focal_length, principal_point=principal_point)
+    check_broadcast(
+        who,
+        R=R.shape[:-2],
+        T=T.shape[:-1],
+        focal_length=focal_length.shape[:-1],
+        principal_point=principal_point.shape[:-1],
+    )
     focal_length, principal_point = torch.broadcast_tensors(focal_length, principal_point)
     focal_length = _matrix(who, "focal_length", focal_length, 2)
     if in_ndc:
@@ -364,6 +377,7 @@ def to_pytorch3d(cameras: Cameras, *, in_ndc: bool = True) -> PyTorch3DCameras:
         tensor([2., 2.])
     """
     who = "to_pytorch3d"
+    check_flag(who, "in_ndc", in_ndc)
     tensors = as_tensors(cameras, who)
     K, R, t = _taken(who, tensors, "half")
     if can_inspect(K) and bool((K[..., 0, 1].abs() > 1e-6 * K[..., 0, 0]).any()):
@@ -371,7 +385,8 @@ def to_pytorch3d(cameras: Cameras, *, in_ndc: bool = True) -> PyTorch3DCameras:
     focal_length = K.diagonal(dim1=-2, dim2=-1)[..., :2]
     principal_point = K[..., :2, 2]
     if in_ndc:
-        size = torch.stack((torch.as_tensor(tensors.width), torch.as_tensor(tensors.height)), -1).to(K.dtype)
+        height, width = image_sizes(tensors)
+        size = torch.stack((width, height), -1).to(K.dtype)
         scale = 0.5 * size.amin(-1, keepdim=True)
         focal_length = focal_length / scale
         principal_point = (0.5 * size - principal_point) / scale

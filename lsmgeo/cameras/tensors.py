@@ -9,14 +9,12 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from lsmgeo._checks import check_devices, check_float, describe
+from lsmgeo._checks import GEOMETRY, LARGEST_COUNT, check_devices, check_geometry, describe
 from lsmgeo._linalg import multiply
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, DTypeError, ShapeError
 
 __all__ = ["CameraTensors", "Cameras", "as_tensors", "check_cameras", "image_sizes", "stack", "to"]
-
-CAMERA_DTYPES = (torch.float32, torch.float64)
 
 
 class CameraTensors(NamedTuple):
@@ -97,8 +95,8 @@ def as_tensors(cameras: Cameras, who: str = "cameras") -> CameraTensors:
             f"got {describe(cameras)}"
         )
     intrinsics, cam_from_world = cameras.intrinsics, cameras.cam_from_world
-    check_float(who, "cameras.intrinsics", intrinsics, "(..., 3, 3) or (..., 4, 4)", dtypes=CAMERA_DTYPES)
-    check_float(who, "cameras.cam_from_world", cam_from_world, "(..., 4, 4)", dtypes=CAMERA_DTYPES)
+    check_geometry(who, "cameras.intrinsics", intrinsics, "(..., 3, 3) or (..., 4, 4)")
+    check_geometry(who, "cameras.cam_from_world", cam_from_world, "(..., 4, 4)")
     if intrinsics.dim() < 2 or tuple(intrinsics.shape[-2:]) not in ((3, 3), (4, 4)):
         raise ShapeError(f"{who}: cameras.intrinsics must be (..., 3, 3) or (..., 4, 4); got {tuple(intrinsics.shape)}")
     if cam_from_world.dim() < 2 or tuple(cam_from_world.shape[-2:]) != (4, 4):
@@ -130,11 +128,16 @@ def image_sizes(cameras: CameraTensors) -> tuple[Tensor, Tensor]:
 
 def _size(who: str, name: str, value: Any, leading: tuple[int, ...], like: Tensor) -> Tensor:
     if isinstance(value, int) and not isinstance(value, bool):
-        if value < 1:
-            raise CameraError(f"{who}: cameras.{name} must be at least 1 pixel; got {value}")
+        if not 1 <= value <= LARGEST_COUNT:
+            raise CameraError(f"{who}: cameras.{name} must be at least 1 pixel, 2^31 - 1 at most; got {value}")
         return torch.full(leading, value, dtype=torch.int64, device=like.device)
-    if not isinstance(value, Tensor) or value.dtype == torch.bool or value.is_complex():
-        raise DTypeError(f"{who}: cameras.{name} must be an int or a real tensor; got {describe(value)}")
+    if (
+        not isinstance(value, Tensor)
+        or value.dtype == torch.bool
+        or value.is_complex()
+        or value.layout != torch.strided
+    ):
+        raise DTypeError(f"{who}: cameras.{name} must be an int or a dense real tensor; got {describe(value)}")
     if tuple(value.shape) != leading:
         raise ShapeError(
             f"{who}: cameras.{name} must have the cameras' leading shape {leading}; got {tuple(value.shape)}"
@@ -203,7 +206,8 @@ def stack(cameras: Sequence[Cameras], dim: int = 0) -> CameraTensors:
         `CameraTensors` with the new leading axis.
 
     Raises:
-        ShapeError: no camera, or unequal leading shapes.
+        DTypeError: no camera, or something else.
+        ShapeError: unequal leading shapes.
 
     Example:
         >>> from lsmgeo.cameras import orbit, stack
@@ -211,23 +215,36 @@ def stack(cameras: Sequence[Cameras], dim: int = 0) -> CameraTensors:
         >>> tuple(stack(views).intrinsics.shape)
         (3, 3, 3)
     """
+    if not isinstance(cameras, list | tuple) or isinstance(cameras, CameraTensors) or not cameras:
+        raise DTypeError(f"stack: cameras must be a list or tuple with at least one camera; got {describe(cameras)}")
     parts = [as_tensors(camera, "stack") for camera in cameras]
-    if not parts:
-        raise ShapeError("stack: cameras must hold at least one camera; got none")
     leading = [tuple(part.cam_from_world.shape[:-2]) for part in parts]
     if len(set(leading)) > 1:
         raise ShapeError(f"stack: cameras must have one leading shape; got {leading}")
-    if not isinstance(dim, int) or not 0 <= dim <= len(leading[0]):
+    if not isinstance(dim, int) or isinstance(dim, bool) or not 0 <= dim <= len(leading[0]):
         raise ShapeError(f"stack: dim must be 0 to {len(leading[0])}; got {describe(dim)}")
     check_devices("stack", **{f"cameras[{i}]": part.intrinsics for i, part in enumerate(parts)})
     fields = (torch.stack([torch.as_tensor(field) for field in column], dim) for column in zip(*parts, strict=True))
     return CameraTensors(*fields)
 
 
-def to(cameras: Cameras, *args: Any, **kwargs: Any) -> CameraTensors:
-    """Move cameras to a device or dtype; the arguments are those of ``torch.Tensor.to``.
+def to(
+    cameras: Cameras, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None
+) -> CameraTensors:
+    """Move cameras to a device, a dtype (which may come first too) or both.
 
     Sizes follow the device and keep their dtype.
+
+    Args:
+        cameras: any number of cameras.
+        device: where to, or a dtype alone.
+        dtype: float32 or float64.
+
+    Returns:
+        `CameraTensors`.
+
+    Raises:
+        DTypeError: no device and no dtype, or one that does not exist or cameras do not come in.
 
     Example:
         >>> import torch
@@ -236,6 +253,17 @@ def to(cameras: Cameras, *args: Any, **kwargs: Any) -> CameraTensors:
         torch.float64
     """
     tensors = as_tensors(cameras, "to")
-    moved = tensors.intrinsics.to(*args, **kwargs)
-    height, width = (size.to(moved.device) for size in image_sizes(tensors))
-    return as_tensors(CameraTensors(moved, tensors.cam_from_world.to(*args, **kwargs), height, width), "to")
+    if isinstance(device, torch.dtype) and dtype is None:
+        device, dtype = None, device
+    if dtype is not None and (not isinstance(dtype, torch.dtype) or dtype not in GEOMETRY):
+        raise DTypeError(f"to: dtype must be float32 or float64; got {describe(dtype)}")
+    if device is not None and not isinstance(device, str | torch.device):
+        raise DTypeError(f"to: device must be a torch.device or its name; got {describe(device)}")
+    if device is None and dtype is None:
+        raise DTypeError("to: device or dtype must be given; got neither")
+    try:
+        place = tensors.intrinsics.device if device is None else torch.device(device)
+    except RuntimeError as error:
+        raise DTypeError(f"to: device must be a torch.device or its name; got {describe(device)}") from error
+    K, E = (matrix.to(place, dtype or matrix.dtype) for matrix in (tensors.intrinsics, tensors.cam_from_world))
+    return CameraTensors(K, E, *(size.to(place) for size in image_sizes(tensors)))

@@ -8,12 +8,20 @@ import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
-from lsmgeo._checks import check_float, check_number, check_size
+from lsmgeo._checks import (
+    GEOMETRY,
+    check_broadcast,
+    check_devices,
+    check_geometry,
+    check_number,
+    check_size,
+    describe,
+)
 from lsmgeo._linalg import cross, homogeneous_row, inverse_3x3, multiply, transform
 from lsmgeo.cameras.matrices import resize_matrix
-from lsmgeo.cameras.tensors import CAMERA_DTYPES, Cameras, CameraTensors, as_tensors, check_cameras, image_sizes
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, check_cameras, image_sizes
 from lsmgeo.debugging import can_inspect
-from lsmgeo.errors import CameraError, OptionError, ShapeError
+from lsmgeo.errors import CameraError, DTypeError, OptionError, ShapeError
 
 __all__ = ["crop", "look_at", "orbit", "perturb", "rays", "resize"]
 
@@ -89,9 +97,9 @@ def crop(cameras: Cameras, top: int | Tensor, left: int | Tensor, height: int, w
     old_height, old_width = image_sizes(tensors)
     K = tensors.intrinsics
     leading = K.shape[:-2]
-    offset = torch.stack(
-        [torch.as_tensor(side, dtype=K.dtype, device=K.device).expand(leading) for side in (left, top, 0)], -1
-    )
+    x, y = (_number("crop", name, side, K, leading) for name, side in (("left", left), ("top", top)))
+    check_devices("crop", cameras=K, left=x, top=y)
+    offset = torch.stack((x.expand(leading), y.expand(leading), x.new_zeros(leading)), -1)
     shift = torch.nn.functional.pad(offset[..., None], (2, 0))  # third column
     return CameraTensors(
         K - shift,
@@ -108,9 +116,27 @@ def _vector(who: str, name: str, value: Vector, like: Tensor | None = None) -> T
             value = torch.as_tensor(value, dtype=dtype or torch.get_default_dtype(), device=device)
         except (TypeError, ValueError) as error:
             raise OptionError(f"{who}: {name} must be x, y, z; got {value!r}") from error
-    check_float(who, name, value, "(..., 3)", dtypes=CAMERA_DTYPES)
+    check_geometry(who, name, value, "(..., 3)")
     if value.dim() < 1 or value.shape[-1] != 3:
         raise ShapeError(f"{who}: {name} must be (..., 3); got {tuple(value.shape)}")
+    return _finite(who, name, value)
+
+
+def _number(who: str, name: str, value: float | Tensor, like: Tensor, leading: Sequence[int] | None = None) -> Tensor:
+    """A number or a tensor of numbers as a finite tensor, which broadcasts to `leading` if given."""
+    if isinstance(value, Tensor):
+        check_geometry(who, name, value, "a number or a tensor", dtypes=(*GEOMETRY, torch.int32, torch.int64))
+        value = value.to(like.dtype) if not value.is_floating_point() else value
+    else:
+        value = like.new_tensor(check_number(who, name, value, "a finite number"))
+    if leading is not None and check_broadcast(who, cameras=leading, **{name: value.shape}) != tuple(leading):
+        raise ShapeError(f"{who}: {name} must broadcast to the cameras' {tuple(leading)}; got {tuple(value.shape)}")
+    return _finite(who, name, value)
+
+
+def _finite(who: str, name: str, value: Tensor) -> Tensor:
+    if can_inspect(value) and not bool(value.isfinite().all()):
+        raise OptionError(f"{who}: {name} must be finite; got a NaN or an infinity")
     return value
 
 
@@ -138,14 +164,21 @@ def look_at(eye: Vector, target: Vector = (0.0, 0.0, 0.0), up: Vector = (0.0, 1.
                 [ 0.,  0.,  1.,  2.],
                 [ 0.,  0.,  0.,  1.]])
     """
-    eye = _vector("look_at", "eye", eye)
-    target, up = _vector("look_at", "target", target, eye), _vector("look_at", "up", up, eye)
+    who = "look_at"
+    eye = _vector(who, "eye", eye)
+    target, up = _vector(who, "target", target, eye), _vector(who, "up", up, eye)
+    check_devices(who, eye=eye, target=target, up=up)
+    check_broadcast(who, eye=eye.shape[:-1], target=target.shape[:-1], up=up.shape[:-1])
+    return _facing(who, "eye, target and up", eye, target, up)
+
+
+def _facing(who: str, names: str, eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     forward = target - eye
     right = cross(forward, up)
     if can_inspect(right):
         scale = torch.linalg.vector_norm(forward, dim=-1) * torch.linalg.vector_norm(up, dim=-1)
         if not bool((torch.linalg.vector_norm(right, dim=-1) > 1e-6 * scale).all()):
-            raise CameraError("look_at: eye, target and up must span a plane (up is along the viewing direction)")
+            raise CameraError(f"{who}: {names} must span a plane (up is along the viewing direction, or there is none)")
     z = forward / torch.linalg.vector_norm(forward, dim=-1, keepdim=True)
     x = right / torch.linalg.vector_norm(right, dim=-1, keepdim=True)
     R = torch.stack(torch.broadcast_tensors(x, cross(z, x), z), -2) + 0.0  # + 0.0: no negative zeros
@@ -192,29 +225,25 @@ def orbit(
                 [-1.,  0.,  0.,  2.],
                 [ 0.,  0.,  0.,  1.]])
     """
-    height, width = check_size("orbit", "(height, width)", (height, width), 2, "two integers")
-    given = [value for value in (azimuth, elevation, distance, focal_length) if isinstance(value, Tensor)]
-    like = given[0] if given else torch.zeros(())
-    numbers = []
-    for name, value in zip(
-        ("azimuth", "elevation", "distance", "focal_length"), (azimuth, elevation, distance, focal_length), strict=True
-    ):
-        if isinstance(value, Tensor):
-            check_float("orbit", name, value, "a number or a tensor", dtypes=CAMERA_DTYPES)
-        else:
-            value = like.new_tensor(check_number("orbit", name, value, "a finite number"))
-        numbers.append(value)
-    turn, tilt, radius, focal = torch.broadcast_tensors(*numbers)
+    who = "orbit"
+    height, width = check_size(who, "(height, width)", (height, width), 2, "two integers")
+    given = {"azimuth": azimuth, "elevation": elevation, "distance": distance, "focal_length": focal_length}
+    like = next((x for x in given.values() if isinstance(x, Tensor) and x.dtype in GEOMETRY), torch.zeros(()))
+    numbers = {name: _number(who, name, value, like) for name, value in given.items()}
+    target = _vector(who, "target", target, like)
+    check_devices(who, **numbers, target=target)
+    check_broadcast(who, **{name: value.shape for name, value in numbers.items()}, target=target.shape[:-1])
+    turn, tilt, radius, focal = torch.broadcast_tensors(*numbers.values())
     a, e = torch.deg2rad(turn), torch.deg2rad(tilt)
-    target = _vector("orbit", "target", target, turn)
     direction = torch.stack((e.cos() * a.cos(), e.sin(), e.cos() * a.sin()), -1)
     zero, one = torch.zeros_like(focal), torch.ones_like(focal)
     rows = (focal, zero, one * (0.5 * width - 0.5), zero, focal, one * (0.5 * height - 0.5), zero, zero, one)
     eye = target + radius[..., None] * direction
-    cam_from_world = look_at(eye, target.expand_as(eye))
+    up = eye.new_tensor([0.0, 1.0, 0.0])
+    cam_from_world = _facing(who, "azimuth, elevation, distance and target", eye, target.expand_as(eye), up)
     intrinsics = torch.stack(rows, -1).unflatten(-1, (3, 3)).expand(*eye.shape[:-1], 3, 3)
-    cameras = as_tensors(CameraTensors(intrinsics, cam_from_world, height, width), "orbit")
-    check_cameras("orbit", cameras)
+    cameras = as_tensors(CameraTensors(intrinsics, cam_from_world, height, width), who)
+    check_cameras(who, cameras)
     return cameras
 
 
@@ -250,13 +279,19 @@ def perturb(
         >>> torch.allclose(noisy.cam_from_world[:, :3, 3], cameras.cam_from_world[:, :3, 3])
         True
     """
-    degrees = check_number("perturb", "degrees", degrees, "a finite number of degrees, at least 0")
-    if degrees < 0:
-        raise OptionError(f"perturb: degrees must be at least 0; got {degrees}")
-    tensors = as_tensors(cameras, "perturb")
+    who = "perturb"
+    degrees = check_number(who, "degrees", degrees, "a number of degrees from 0 to 180")
+    if not 0 <= degrees <= 180:
+        raise OptionError(f"{who}: degrees must be a number of degrees from 0 to 180; got {degrees}")
+    if generator is not None and not isinstance(generator, torch.Generator):
+        raise DTypeError(f"{who}: generator must be a torch.Generator or None; got {describe(generator)}")
+    tensors = as_tensors(cameras, who)
     E = tensors.cam_from_world
-    target = _vector("perturb", "target", target, E)
     leading = E.shape[:-2]
+    target = _vector(who, "target", target, E)
+    check_devices(who, cameras=E, target=target)
+    if check_broadcast(who, cameras=leading, target=target.shape[:-1]) != tuple(leading):
+        raise ShapeError(f"{who}: target must broadcast to the cameras' {tuple(leading)}; got {tuple(target.shape)}")
     axis = torch.randn(*leading, 3, generator=generator, dtype=E.dtype, device=E.device)
     axis = axis / torch.linalg.vector_norm(axis, dim=-1, keepdim=True).clamp_min(torch.finfo(E.dtype).tiny)
     angle = torch.rand(*leading, 1, generator=generator, dtype=E.dtype, device=E.device) * 2.0 - 1.0
@@ -265,7 +300,9 @@ def perturb(
     R, t = E[..., :3, :3], E[..., :3, 3]
     offset = target.expand(*leading, 3) - transform(turn, target.expand(*leading, 3))
     rows = torch.cat((multiply(R, turn), (transform(R, offset) + t)[..., None]), -1)
-    return tensors._replace(cam_from_world=homogeneous_row(rows))
+    noisy = tensors._replace(cam_from_world=homogeneous_row(rows))
+    check_cameras(who, noisy)
+    return noisy
 
 
 def rays(cameras: Cameras, size: tuple[int, int] | None = None) -> tuple[Tensor, Tensor]:
@@ -291,17 +328,19 @@ def rays(cameras: Cameras, size: tuple[int, int] | None = None) -> tuple[Tensor,
         >>> directions[1, 1]
         tensor([-1.,  0.,  0.])
     """
-    tensors = as_tensors(cameras, "rays")
-    check_cameras("rays", tensors)
+    who = "rays"
+    tensors = as_tensors(cameras, who)
+    check_cameras(who, tensors)
     if size is None:
-        size = common_size("rays", tensors)
+        height, width = common_size(who, tensors)
     else:
-        tensors = resize(tensors, *size)
+        height, width = check_size(who, "size", size, 2, "(h, w)")
+        tensors = resize(tensors, height, width)
     K, E = tensors.intrinsics, tensors.cam_from_world
     R_inverse = E[..., :3, :3].transpose(-1, -2)
     v, u = torch.meshgrid(
-        torch.arange(size[0], dtype=K.dtype, device=K.device),
-        torch.arange(size[1], dtype=K.dtype, device=K.device),
+        torch.arange(height, dtype=K.dtype, device=K.device),
+        torch.arange(width, dtype=K.dtype, device=K.device),
         indexing="ij",
     )
     pixels = torch.stack((u, v, torch.ones_like(u)), -1)  # (h, w, 3)

@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Tensor
 
-from lsmgeo._checks import check_choice
+from lsmgeo._checks import check_choice, check_float
 from lsmgeo.errors import BackendError
 from lsmgeo.kernels import reference
 from lsmgeo.kernels.request import OPERATORS, Options, Sites
@@ -82,6 +82,7 @@ def explain(operator: str, source: Tensor, **options: Any) -> str:
           reference: taken
     """
     check_choice("explain", "operator", operator, OPERATORS)
+    check_float("explain", "source", source, "(B, V, C, h, w) or (B, C, D, H, W)", rank=5)
     call = Options.checked("explain", volume=operator in ("plane_sweep_project", "project_reduce"), **options)
     lines = [f"{operator} of {tuple(source.shape)} {str(source.dtype).removeprefix('torch.')} on {source.device.type}"]
     taken = False

@@ -1,0 +1,1 @@
+"""The operators under compilers, exporters and transforms, and beside kornia, OpenCV and other conventions."""

@@ -215,9 +215,7 @@ def write_picture(result: DemoResult, path: Path) -> Path:
         axes.set_title(f"{title}, view {result.view}")
         figure.colorbar(picture, ax=axes, location="bottom", label="camera z [world units]")
     picture = error.imshow(100 * result.error, cmap="magma", vmin=0, vmax=3)
-    error.set_title(
-        f"relative error, median {100 * result.median_error:.2f} %\n(large where the sphere blocks other views)"
-    )
+    error.set_title(f"relative error, median {100 * result.median_error:.2f} %\n(the sphere hides the floor beside it)")
     figure.colorbar(picture, ax=error, location="bottom", label="|recovered - true| / true [%]", extend="max")
     for axes in (truth, depth, error):
         axes.set_facecolor("0.85")

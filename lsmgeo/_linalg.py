@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["affine_inverse", "cross", "homogeneous_row", "inverse_3x3", "multiply", "transform"]
+__all__ = ["affine_inverse", "basis_row", "cross", "homogeneous_row", "inverse_3x3", "multiply", "transform"]
 
 
 def multiply(left: Tensor, right: Tensor) -> Tensor:
@@ -39,8 +39,13 @@ def inverse_3x3(matrix: Tensor) -> Tensor:
 
 def homogeneous_row(rows: Tensor) -> Tensor:
     """Append the row (0, 0, 0, 1) to (..., 3, 4)."""
-    last = rows.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*rows.shape[:-2], 1, 4)
-    return torch.cat((rows, last), -2)
+    return torch.cat((rows, basis_row(rows, 4, 3)), -2)
+
+
+def basis_row(rows: Tensor, length: int, index: int) -> Tensor:
+    """The row (..., 1, length) with a 1 at `index`, to go with rows (..., n, length); made on their device."""
+    row = torch.eye(length, dtype=rows.dtype, device=rows.device)[index : index + 1]
+    return row.expand(*rows.shape[:-2], 1, length)
 
 
 def affine_inverse(matrix: Tensor) -> Tensor:

@@ -5,6 +5,8 @@ The matrices are composed in float64. Nothing below this module knows cameras or
 
 from __future__ import annotations
 
+from math import prod
+
 import torch
 from torch import Tensor
 
@@ -24,23 +26,17 @@ Grid = VoxelGrid | FrustumGrid
 
 def check_features(who: str, features: Tensor, count: int | None = None) -> tuple[int, int]:
     """Require (B, V, C, h, w), with B*V = `count` if given; return (B, V)."""
-    expected = "(B, V, C, h, w)" if count is None else f"(B, V, C, h, w) with B*V = {count} cameras"
+    expected = "(B, V, C, h, w)"
     check_float(who, "features", features, expected)
-    if features.dim() != 5:
-        raise ShapeError(f"{who}: features must be {expected}; got {tuple(features.shape)}")
+    if features.dim() != 5 or (count is not None and features.shape[0] * features.shape[1] != count):
+        # The text is made here alone: under a trace, a number put into a text is a constant of the graph.
+        views = "" if count is None else f" with B*V = {count} cameras"
+        product = "" if features.dim() != 5 else f", that is {features.shape[0] * features.shape[1]}"
+        raise ShapeError(f"{who}: features must be {expected}{views}; got {tuple(features.shape)}{product}")
     B, V, _, h, w = features.shape
     if V < 1 or h < 1 or w < 1:
         raise ShapeError(f"{who}: features must be {expected}, V, h and w at least 1; got {tuple(features.shape)}")
-    if count is not None and B * V != count:
-        raise ShapeError(f"{who}: features must be {expected}; got {tuple(features.shape)}, that is {B * V}")
     return B, V
-
-
-def _camera_count(cameras: CameraTensors) -> int:
-    count = 1
-    for size in cameras.cam_from_world.shape[:-2]:
-        count *= size
-    return count
 
 
 def _views(
@@ -66,7 +62,7 @@ def _views(
 def image_matrices(who: str, features: Tensor, cameras: Cameras, view_mask: Tensor | None) -> CameraMatrices:
     """The cameras (B, V) of a feature map, checked, K resized to it."""
     tensors = as_tensors(cameras, who)
-    views = check_features(who, features, _camera_count(tensors))
+    views = check_features(who, features, prod(tensors.cam_from_world.shape[:-2]))
     tensors = _views(who, tensors, views, view_mask, features=features)
     return camera_matrices(tensors, (features.shape[3], features.shape[4]), view_mask)
 
@@ -74,15 +70,17 @@ def image_matrices(who: str, features: Tensor, cameras: Cameras, view_mask: Tens
 def _lattice(who: str, grid: Grid, source: Tensor) -> Lattice:
     if not isinstance(grid, VoxelGrid | FrustumGrid):
         raise DTypeError(f"{who}: grid must be a VoxelGrid or a FrustumGrid; got {describe(grid)}")
-    lattice = grid.lattice()
     if not isinstance(source, Tensor):
-        return lattice
-    for tensor in (lattice.world_from_lattice, lattice.z):
-        if tensor.dim() > 1 + (tensor is lattice.world_from_lattice) and tensor.shape[0] != source.shape[0]:
+        return grid.lattice()
+    lattice = grid.lattice(source.device)
+    T, z = lattice.world_from_lattice, lattice.z
+    for scenes in (*T.shape[:-2], *z.shape[:-1]):
+        if scenes != source.shape[0]:
             raise ShapeError(
-                f"{who}: grid must be of one scene or of B = {source.shape[0]}; got {tensor.shape[0]} scenes"
+                f"{who}: grid must have one pose and one row of depths, or as many as scenes, B = {source.shape[0]}; "
+                f"got {scenes}"
             )
-    return lattice.to(source.device)
+    return lattice
 
 
 def direction_matrix(matrices: CameraMatrices, T: Tensor, frame: str) -> Tensor:
@@ -129,7 +127,7 @@ def sweep_sites(
             f"{who}: volume must be (B, C, D, H, W) with the grid's (D, H, W) = {grid.shape}; got {tuple(volume.shape)}"
         )
     tensors = as_tensors(cameras, who)
-    count, scenes = _camera_count(tensors), volume.shape[0]
+    count, scenes = prod(tensors.cam_from_world.shape[:-2]), volume.shape[0]
     leading = tensors.cam_from_world.shape[:-2]
     if len(leading) == 2:
         views = (leading[0], leading[1])

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from typing import Literal
 
 __all__ = ["demo", "main", "reconstruct"]
+
+KINDS = {"int": "a whole number", "float": "a finite number"}
+LONGEST_MESSAGE = 300
 
 
 def demo(out: str = "lsmgeo-demo") -> None:
@@ -92,23 +96,21 @@ def reconstruct(
     )
     name = images.names[view]
     depth = torch.where(result.mask, result.depth_map.depth, 0.0)
-    folder = Path(out)
-    written = {}
+    # All is made before the first file is written: what fails or is interrupted until then leaves nothing behind.
     if depth_format == "npy":
         buffer = io.BytesIO()
         np.save(buffer, depth.numpy())
-        written["depth"] = data.write_atomic(folder / "depth.npy", buffer.getvalue())
+        files = {"depth": ("depth.npy", buffer.getvalue())}
     else:
         unit = float(result.depths[-1]) / 65000
-        written[f"depth in steps of {unit:.6g}"] = data.write_atomic(
-            folder / "depth16.png", pictures.depth_as_png16(depth, unit)
-        )
-    coloured = pictures.png(pictures.coloured_depth(depth, result.mask))
-    written["depth in colours"] = data.write_atomic(folder / "depth.png", coloured)
+        files = {f"depth in steps of {unit:.6g}": ("depth16.png", pictures.depth_as_png16(depth, unit))}
+    files["depth in colours"] = ("depth.png", pictures.png(pictures.coloured_depth(depth, result.mask)))
+    title = f"{Path(scene).name}, view {view} ({name}), plane sweep"
+    files["summary"] = ("summary.png", pictures.summary(result, title))
+    folder = Path(out)
+    written = {what: data.write_atomic(folder / file, content) for what, (file, content) in files.items()}
     if len(result.points):
         written["points"] = data.write_point_cloud(folder / "points.ply", result.points, result.colours)
-    title = f"{Path(scene).name}, view {view} ({name}), plane sweep"
-    written["summary"] = data.write_atomic(folder / "summary.png", pictures.summary(result, title))
 
     height, width = result.mask.shape
     print(f"scene:       {len(images)} photographs, {images.source}")
@@ -137,25 +139,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: 0, 2 after a wrong argument or a file that cannot be used, 130 after an interrupt.
     """
-    from importlib.metadata import PackageNotFoundError, version
-
-    from jsonargparse import auto_cli
+    from argparse import ArgumentError
 
     from lsmgeo.errors import LsmGeoError
 
     try:
-        release = version("lsmgeo")
-    except PackageNotFoundError:
-        from lsmgeo import __version__ as release
-    try:
-        auto_cli(
-            {"demo": demo, "reconstruct": reconstruct},
-            args=None if arguments is None else list(arguments),
-            as_positional=True,
-            prog="lsmgeo",
-            version=release,
-            description="Features between images and 3D space.",
-        )
+        _run(arguments)
+    except ArgumentError as error:
+        print(f"lsmgeo: error: {_reason(str(error))} (see lsmgeo --help)", file=sys.stderr)
+        return 2
     except LsmGeoError as error:
         print(f"lsmgeo: error: {error}", file=sys.stderr)
         return 2
@@ -163,6 +155,42 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("lsmgeo: interrupted", file=sys.stderr)
         return 130
     return 0
+
+
+def _run(arguments: Sequence[str] | None) -> None:
+    from importlib.metadata import PackageNotFoundError, version
+
+    from jsonargparse import auto_cli
+
+    try:
+        release = version("lsmgeo")
+    except PackageNotFoundError:
+        from lsmgeo import __version__ as release
+    auto_cli(
+        {"demo": demo, "reconstruct": reconstruct},
+        args=None if arguments is None else list(arguments),
+        as_positional=True,
+        prog="lsmgeo",
+        version=release,
+        description="Features between images and 3D space.",
+        # Errors come here, to become one line; and an option is what it is called, not how its name begins.
+        exit_on_error=False,
+        allow_abbrev=False,
+    )
+
+
+def _reason(message: str) -> str:
+    """What the parser of the arguments says over several lines, in one."""
+    found = re.match(r'Parser key "(.+?)":(.*?)(?:Given value type:.*?Given|Got) value: (.*)', message, re.DOTALL)
+    if found:
+        name, expected, value = found.groups()
+        choices = re.search(r"Literal\[(.*?)\]", expected)
+        kinds = [words for kind, words in KINDS.items() if f"<class '{kind}'>" in expected]
+        if choices or kinds:
+            wanted = f"one of {choices[1]}" if choices else " or ".join(kinds)
+            message = f"{name} must be {wanted}; got {value!r}"
+    message = " ".join(message.split())
+    return message if len(message) <= LONGEST_MESSAGE else f"{message[:LONGEST_MESSAGE]} ..."
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import torch
 
 __all__ = ["can_inspect", "debug"]
 
+PLAIN = (torch.Tensor, torch.nn.Parameter)
 _debug: ContextVar[bool] = ContextVar("lsmgeo_debug", default=False)
 
 
@@ -42,6 +43,7 @@ def is_traced() -> bool:
 
 def can_inspect(*tensors: torch.Tensor) -> bool:
     """Whether the values of these tensors may be read without a GPU waiting or a trace breaking."""
-    if is_traced():
+    # Tensors without values of their own (meta, fake, distributed) cannot be read.
+    if is_traced() or any(tensor.is_meta or type(tensor) not in PLAIN for tensor in tensors):
         return False
     return _debug.get() or all(tensor.device.type == "cpu" for tensor in tensors)

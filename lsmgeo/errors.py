@@ -45,7 +45,7 @@ class OptionError(LsmGeoError, ValueError):
     """An option has a value that the operator does not know."""
 
 
-class BackendError(LsmGeoError, RuntimeError):
+class BackendError(LsmGeoError, ValueError):
     """A backend was asked for by name and cannot run this call."""
 
 

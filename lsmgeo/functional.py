@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lsmgeo import kernels
 from lsmgeo._checks import check_choices, check_devices, check_flag, check_float, check_geometry, check_mask, describe
+from lsmgeo._dtypes import computing_dtype, saturating_cast
 from lsmgeo._sites import Cameras, Grid, check_features, direction_matrix, image_matrices, image_sites, sweep_sites
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import GridError, OptionError, ShapeError
@@ -442,6 +443,4 @@ def view_statistics(volume: Tensor, visible: Tensor, statistics: Names, view_mas
     check_devices(who, volume=volume, visible=visible, view_mask=view_mask)
     if view_mask is not None:
         visible = visible & view_mask.reshape(*view_mask.shape, *(1,) * (visible.dim() - 2))
-    computing = volume if volume.dtype == torch.float64 else volume.float()
-    largest = torch.finfo(volume.dtype).max
-    return _view_statistics(computing, visible, names).clamp(-largest, largest).to(volume.dtype)
+    return saturating_cast(_view_statistics(volume.to(computing_dtype(volume)), visible, names), volume.dtype)

@@ -23,7 +23,7 @@ from lsmgeo._checks import (
     describe,
     moved,
 )
-from lsmgeo._linalg import affine_inverse, inverse_3x3, multiply
+from lsmgeo._linalg import affine_inverse, basis_row, homogeneous_row, inverse_3x3, multiply
 from lsmgeo.cameras.matrices import camera_matrices
 from lsmgeo.cameras.tensors import Cameras, as_tensors, check_cameras
 from lsmgeo.cameras.transforms import common_size
@@ -46,11 +46,6 @@ class Lattice(NamedTuple):
     y: Tensor
     z: Tensor
     projective: bool
-
-    def to(self, device: torch.device) -> Lattice:
-        """The same lattice on another device."""
-        T, x, y, z = (moved("grid", name, tensor, device) for name, tensor in zip("Txyz", self[:4], strict=True))
-        return Lattice(T, x, y, z, self.projective)
 
     def centers(self) -> Tensor:
         """World positions of the sites, (D, H, W, 3) or (B, D, H, W, 3)."""
@@ -133,28 +128,33 @@ class VoxelGrid:
     @property
     def world_from_lattice(self) -> Tensor:
         """World from voxel index, (4, 4) or (B, 4, 4), float64: ``X = A (i_x, i_y, i_z, 1)``."""
+        return self._world_from_lattice(None)
+
+    def _world_from_lattice(self, device: torch.device | None) -> Tensor:
+        matrix = self.world_from_grid
+        if matrix is not None:
+            device = matrix.device if device is None else device
+            matrix = moved("VoxelGrid", "world_from_grid", matrix, device)
         lower, upper = self.lower, self.upper
         counts = tuple(reversed(self.shape))  # type: ignore[arg-type]
         steps = [(high - low) / n for low, high, n in zip(lower, upper, counts, strict=True)]  # type: ignore[arg-type]
-        rows = [[0.0] * 4 for _ in range(4)]
-        for axis, (step, low) in enumerate(zip(steps, lower, strict=True)):  # type: ignore[arg-type]
-            rows[axis][axis], rows[axis][3] = step, low + 0.5 * step
-        rows[3][3] = 1.0
-        device = None if self.world_from_grid is None else self.world_from_grid.device
-        box = torch.tensor(rows, dtype=torch.float64, device=device)
-        if self.world_from_grid is None:
-            return box
-        last = box[3:].expand(*self.world_from_grid.shape[:-2], 1, 4)
-        return multiply(torch.cat((self.world_from_grid[..., :3, :].double(), last), -2), box)
+        firsts = [low + 0.5 * step for low, step in zip(lower, steps, strict=True)]  # type: ignore[arg-type]
+        # Filled on the device: a copy from the host would make a GPU wait.
+        scale, shift = (
+            torch.stack([torch.full((), item, dtype=torch.float64, device=device) for item in items])
+            for items in (steps, firsts)
+        )
+        box = homogeneous_row(torch.cat((torch.diag(scale), shift[:, None]), -1))
+        return box if matrix is None else multiply(homogeneous_row(matrix[..., :3, :].double()), box)
 
     @property
     def lattice_from_world(self) -> Tensor:
         """Voxel index from world, (4, 4) or (B, 4, 4), float64."""
         return affine_inverse(self.world_from_lattice)
 
-    def lattice(self) -> Lattice:
-        """The grid as the operators see it."""
-        T = self.world_from_lattice
+    def lattice(self, device: torch.device | None = None) -> Lattice:
+        """The grid as the operators see it, on a device or where it is."""
+        T = self._world_from_lattice(device)
         depth, height, width = self.shape  # type: ignore[misc]
         x, y, z = (torch.arange(n, dtype=T.dtype, device=T.device) for n in (width, height, depth))
         return Lattice(T, x, y, z, False)
@@ -205,6 +205,13 @@ def check_depths(who: str, depths: Tensor, expected: str = "(P,) or (B, P)", vie
                 f"{who}: depths must be positive, finite and strictly ascending; got "
                 f"{[float(f'{item:.6g}') for item in row[:6].tolist()]}{'...' if row.numel() > 6 else ''}"
             )
+
+
+def check_constant_depths(who: str, depths: Tensor) -> None:
+    """Require depths that a module may keep: no parameter, which it would take into its state."""
+    if isinstance(depths, torch.nn.Parameter):
+        raise DTypeError(f"{who}: depths must be a plain tensor; got a Parameter (pass learned depths to the function)")
+    check_depths(who, depths, "(P,), (B, P) or (B, V, P)")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -279,15 +286,15 @@ class FrustumGrid:
         """(u, v, 1/depth, 1) up to a factor from homogeneous world, (4, 4) or (B, 4, 4), float64."""
         matrices = camera_matrices(as_tensors(self.camera), self.size)
         P = matrices.projection
-        last = P.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*P.shape[:-2], 4)
-        return torch.stack((P[..., 0, :], P[..., 1, :], last, P[..., 2, :]), -2)
+        return torch.cat((P[..., :2, :], basis_row(P, 4, 3), P[..., 2:, :]), -2)
 
-    def lattice(self) -> Lattice:
-        """The grid as the operators see it."""
+    def lattice(self, device: torch.device | None = None) -> Lattice:
+        """The grid as the operators see it, on a device or where it is."""
         T = self.world_from_lattice
+        T = T if device is None else moved("FrustumGrid", "camera", T, device)
         _, height, width = self.shape
         x, y = (torch.arange(n, dtype=T.dtype, device=T.device) for n in (width, height))
-        return Lattice(T, x, y, 1.0 / self.depths.double(), True)
+        return Lattice(T, x, y, 1.0 / moved("FrustumGrid", "depths", self.depths, T.device).double(), True)
 
     def centers(self) -> Tensor:
         """Site positions in the world, (P, h, w, 3) or (B, P, h, w, 3) as x, y, z, of the depths' dtype."""

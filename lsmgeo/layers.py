@@ -9,7 +9,7 @@ from lsmgeo._checks import check_flag, check_size, describe, moved
 from lsmgeo._sites import Cameras, Grid
 from lsmgeo.errors import DTypeError, GridError
 from lsmgeo.functional import Names, Projected, Unprojected
-from lsmgeo.grids import FrustumGrid, VoxelGrid, check_depths
+from lsmgeo.grids import FrustumGrid, VoxelGrid, check_constant_depths
 from lsmgeo.kernels.request import Options
 
 __all__ = ["PlaneSweepProject", "Unproject"]
@@ -164,7 +164,7 @@ class PlaneSweepProject(nn.Module):
         if grid is not None and not isinstance(grid, VoxelGrid):
             raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
         if depths is not None:
-            check_depths(who, depths, "(P,), (B, P) or (B, V, P)")
+            check_constant_depths(who, depths)
         if size is not None:
             check_size(who, "size", size, 2, "(h, w)")
         check_flag(who, "flatten", flatten)

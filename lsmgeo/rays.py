@@ -12,12 +12,22 @@ import torch
 from torch import Tensor, nn
 
 from lsmgeo import kernels
-from lsmgeo._checks import LARGEST_COUNT, check_broadcast, check_devices, check_flag, check_float, describe, moved
+from lsmgeo._checks import (
+    LARGEST_COUNT,
+    check_broadcast,
+    check_devices,
+    check_flag,
+    check_float,
+    check_size,
+    describe,
+    moved,
+)
+from lsmgeo._dtypes import computing_dtype, saturating_cast
 from lsmgeo._sites import Cameras, sweep_sites
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
 from lsmgeo.functional import Names, Projected
-from lsmgeo.grids import VoxelGrid, check_depths
+from lsmgeo.grids import VoxelGrid, check_constant_depths
 from lsmgeo.kernels.request import Options
 
 __all__ = ["Composited", "ProjectReduce", "composite", "expected_depth", "max_along_rays", "project_reduce"]
@@ -42,7 +52,7 @@ def _check_visible(who: str, visible: Tensor | None, planes: Tensor) -> None:
 
 
 def _along_rays(who: str, depths: Tensor, planes: Tensor) -> Tensor:
-    """Depths (P,) or (..., P) as (..., P, 1, 1) against planes (..., P, h, w)."""
+    """Depths (P,) or (..., P) as (..., P, 1, 1) against planes (..., P, h, w), in the computing dtype."""
     check_float(who, "depths", depths, "(P,) or (..., P)")
     if depths.dim() < 1 or depths.shape[-1] != planes.shape[-3]:
         raise ShapeError(f"{who}: depths must be (..., P) with P = {planes.shape[-3]}; got {tuple(depths.shape)}")
@@ -50,7 +60,7 @@ def _along_rays(who: str, depths: Tensor, planes: Tensor) -> Tensor:
     check_broadcast(who, depths=depths.shape[:-1], planes=planes.shape[:-3])
     if can_inspect(depths) and not bool(depths.isfinite().all()):
         raise GridError(f"{who}: depths must be finite; got a NaN or an infinity")
-    return depths.to(planes.dtype)[..., None, None]
+    return depths.to(computing_dtype(planes))[..., None, None]
 
 
 def expected_depth(scores: Tensor, depths: Tensor, visible: Tensor | None = None) -> Tensor:
@@ -81,13 +91,15 @@ def expected_depth(scores: Tensor, depths: Tensor, visible: Tensor | None = None
     _check_planes(who, "scores", scores)
     _check_visible(who, visible, scores)
     planes = _along_rays(who, depths, scores)
+    computing = scores.to(planes.dtype)
     if visible is None:
-        return (scores.softmax(-3) * planes).sum(-3)
+        return saturating_cast((computing.softmax(-3) * planes).sum(-3), scores.dtype)
     seen = visible.expand(scores.shape)
     any_seen = seen.any(-3, keepdim=True)
     # Rays with no sample get even weights, which are then dropped: a softmax over nothing is NaN.
-    weights = torch.where(seen | ~any_seen, scores, -torch.inf).softmax(-3)
-    return torch.where(any_seen.squeeze(-3), (weights * planes).sum(-3), 0.0)
+    hidden = torch.where(any_seen, -torch.inf, 0.0).to(planes.dtype)
+    weights = torch.where(seen, computing, hidden).softmax(-3)
+    return saturating_cast(torch.where(any_seen.squeeze(-3), (weights * planes).sum(-3), 0.0), scores.dtype)
 
 
 def max_along_rays(maps: Tensor, visible: Tensor | None = None) -> Tensor:
@@ -168,14 +180,16 @@ def composite(alpha: Tensor, values: Tensor, depths: Tensor, visible: Tensor | N
     check_devices(who, alpha=alpha, values=values)
     _check_visible(who, visible, alpha)
     planes = _along_rays(who, depths, alpha)
+    output = alpha.dtype
+    alpha, values = alpha.to(planes.dtype), values.to(planes.dtype)
     if visible is not None:
-        alpha = torch.where(visible, alpha, 0.0)
+        seen = visible.expand(alpha.shape)
+        alpha, values = torch.where(seen, alpha, 0.0), torch.where(seen[..., None, :, :, :], values, 0.0)
     through = (1.0 - alpha).cumprod(-3)
     before = torch.cat((torch.ones_like(through[..., :1, :, :]), through[..., :-1, :, :]), -3)
     weights = alpha * before
-    return Composited(
-        (weights[..., None, :, :, :] * values).sum(-3), (weights * planes).sum(-3), through[..., -1, :, :], weights
-    )
+    seen_values, depth = (weights[..., None, :, :, :] * values).sum(-3), (weights * planes).sum(-3)
+    return Composited(*(saturating_cast(x, output) for x in (seen_values, depth, through[..., -1, :, :], weights)))
 
 
 def project_reduce(
@@ -196,6 +210,9 @@ def project_reduce(
     backend: str = "auto",
 ) -> Projected:
     """Sweep a volume and map the C' P stacked channels linearly to O, without ever holding them.
+
+    The linear map is computed in float32 (float64 for a float64 volume) under autocast too; on a GPU it follows
+    ``torch.set_float32_matmul_precision``.
 
     Equation: ``conv2d(plane_sweep_project(volume, ...).maps, weight, bias)`` with a 1x1 kernel, summed over the planes
     (the learned ray pooling of Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017).
@@ -261,10 +278,7 @@ def project_reduce(
             raise ShapeError(f"{who}: bias must be (O,) = ({weight.shape[0]},); got {tuple(bias.shape)}")
     check_devices(who, volume=volume, weight=weight, bias=bias)
     stacked = weight.unflatten(1, (channels, planes))
-    maps, visible = kernels.run("project_reduce", volume, sites, stacked, options=options, backend=backend)
-    if bias is not None:
-        maps = maps + bias.to(maps.dtype)[:, None, None]
-    return Projected(maps, visible)
+    return Projected(*kernels.run("project_reduce", volume, sites, stacked, bias, options=options, backend=backend))
 
 
 class ProjectReduce(nn.Module):
@@ -335,7 +349,9 @@ class ProjectReduce(nn.Module):
                 raise OptionError(f"{who}: {name} must be an integer, at least 1; got {describe(value)}")
         if not isinstance(grid, VoxelGrid):
             raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
-        check_depths(who, depths, "(P,), (B, P) or (B, V, P)")
+        check_constant_depths(who, depths)
+        if size is not None:
+            check_size(who, "size", size, 2, "(h, w)")
         check_flag(who, "bias", bias)
         self.grid = grid
         self.depths = depths

@@ -120,7 +120,8 @@ def from_opencv(
 
     Args:
         intrinsics: (..., 3, 3) in pixels.
-        rotation: (..., 3) axis-angle vectors (``rvec``, radians) or (..., 3, 3) matrices.
+        rotation: (..., 3, 3) matrices, or (..., 3) axis-angle vectors (``rvec``, radians); what ends in (3, 3) is taken
+            for matrices.
         translation: (..., 3), world units.
         height: image height in pixels, an int or (...).
         width: image width in pixels, an int or (...).
@@ -143,7 +144,7 @@ def from_opencv(
     who = "from_opencv"
     K = _matrix(who, "intrinsics", intrinsics, 3, 3)
     check_geometry(who, "rotation", rotation, "(..., 3) or (..., 3, 3)")
-    if rotation.dim() >= 2 and tuple(rotation.shape[-2:]) == (3, 3) and rotation.dim() == K.dim():
+    if tuple(rotation.shape[-2:]) == (3, 3):
         R = rotation
     else:
         vectors = _matrix(who, "rotation", rotation, 3)

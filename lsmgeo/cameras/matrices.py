@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lsmgeo._linalg import inverse_3x3, multiply, transform
+from lsmgeo._linalg import basis_row, inverse_3x3, multiply, transform
 from lsmgeo.cameras.tensors import CameraTensors, image_sizes
 
 __all__ = ["CameraMatrices", "camera_matrices", "resize_matrix"]
@@ -31,8 +31,7 @@ class CameraMatrices(NamedTuple):
         """T, (..., 4, 4), with ``X ~ T (u, v, 1/depth, 1)``; column three is the camera centre."""
         rays = multiply(self.rotation.transpose(-1, -2), inverse_3x3(self.intrinsics))  # R^T K^-1
         rows = torch.cat((rays[..., :2], self.center[..., None], rays[..., 2:]), -1)
-        last = rows.new_tensor([0.0, 0.0, 1.0, 0.0]).expand(*rows.shape[:-2], 1, 4)
-        return torch.cat((rows, last), -2)
+        return torch.cat((rows, basis_row(rows, 4, 2)), -2)
 
 
 def resize_matrix(
@@ -72,8 +71,7 @@ def camera_matrices(
         cam_from_world = torch.where(used, cam_from_world, identity)
         height, width = (torch.where(view_mask, side, torch.ones_like(side)) for side in (height, width))
     K = intrinsics[..., :2, :].double()
-    last = K.new_tensor([0.0, 0.0, 1.0]).expand(*K.shape[:-2], 1, 3)
-    K = torch.cat((K, last), -2)
+    K = torch.cat((K, basis_row(K, 3, 2)), -2)
     if size is not None:
         K = multiply(resize_matrix(height, width, *size), K)
     R = cam_from_world[..., :3, :3].double()

@@ -18,10 +18,10 @@ from lsmgeo._checks import (
     describe,
 )
 from lsmgeo._linalg import cross, homogeneous_row, inverse_3x3, multiply, transform
-from lsmgeo.cameras.matrices import resize_matrix
+from lsmgeo.cameras.matrices import camera_matrices, resize_matrix
 from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, check_cameras, image_sizes
 from lsmgeo.debugging import can_inspect
-from lsmgeo.errors import CameraError, DTypeError, OptionError, ShapeError
+from lsmgeo.errors import CameraError, DeviceError, DTypeError, OptionError, ShapeError
 
 __all__ = ["crop", "look_at", "orbit", "perturb", "rays", "resize"]
 
@@ -97,7 +97,7 @@ def crop(cameras: Cameras, top: int | Tensor, left: int | Tensor, height: int, w
     old_height, old_width = image_sizes(tensors)
     K = tensors.intrinsics
     leading = K.shape[:-2]
-    x, y = (_number("crop", name, side, K, leading) for name, side in (("left", left), ("top", top)))
+    x, y = (_number("crop", name, side, K, leading).to(K.dtype) for name, side in (("left", left), ("top", top)))
     check_devices("crop", cameras=K, left=x, top=y)
     offset = torch.stack((x.expand(leading), y.expand(leading), x.new_zeros(leading)), -1)
     shift = torch.nn.functional.pad(offset[..., None], (2, 0))  # third column
@@ -287,6 +287,8 @@ def perturb(
         raise DTypeError(f"{who}: generator must be a torch.Generator or None; got {describe(generator)}")
     tensors = as_tensors(cameras, who)
     E = tensors.cam_from_world
+    if generator is not None and generator.device.type != E.device.type:
+        raise DeviceError(f"{who}: generator must be on the cameras' {E.device}; got one on {generator.device}")
     leading = E.shape[:-2]
     target = _vector(who, "target", target, E)
     check_devices(who, cameras=E, target=target)
@@ -335,18 +337,18 @@ def rays(cameras: Cameras, size: tuple[int, int] | None = None) -> tuple[Tensor,
         height, width = common_size(who, tensors)
     else:
         height, width = check_size(who, "size", size, 2, "(h, w)")
-        tensors = resize(tensors, height, width)
-    K, E = tensors.intrinsics, tensors.cam_from_world
-    R_inverse = E[..., :3, :3].transpose(-1, -2)
+    dtype, device = tensors.intrinsics.dtype, tensors.intrinsics.device
+    matrices = camera_matrices(tensors, (height, width))
     v, u = torch.meshgrid(
-        torch.arange(height, dtype=K.dtype, device=K.device),
-        torch.arange(width, dtype=K.dtype, device=K.device),
+        torch.arange(height, dtype=torch.float64, device=device),
+        torch.arange(width, dtype=torch.float64, device=device),
         indexing="ij",
     )
     pixels = torch.stack((u, v, torch.ones_like(u)), -1)  # (h, w, 3)
-    directions = transform(multiply(R_inverse, inverse_3x3(K))[..., None, None, :, :], pixels)
+    world_from_pixel = multiply(matrices.rotation.transpose(-1, -2), inverse_3x3(matrices.intrinsics))
+    directions = transform(world_from_pixel[..., None, None, :, :], pixels)
     directions = directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True)
-    return 0.0 - transform(R_inverse, E[..., :3, 3]), directions
+    return (matrices.center + 0.0).to(dtype), directions.to(dtype)
 
 
 def common_size(who: str, cameras: CameraTensors) -> tuple[int, int]:

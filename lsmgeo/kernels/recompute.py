@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from lsmgeo.debugging import is_traced
 
@@ -36,6 +37,8 @@ class _Recomputed(torch.autograd.Function):
             inputs = [x if x is None else x.detach().requires_grad_(need) for x, need in pairs]
         with torch.enable_grad():
             values, _ = ctx.function(*inputs)
+            if not values.requires_grad:  # nearest sampling, say, does not depend on the geometry
+                return (None,) * len(ctx.needs_input_grad)
             wanted = [x for x, need in zip(inputs, needed, strict=True) if need]
             found = iter(torch.autograd.grad(values, wanted, gradients[0], create_graph=twice, allow_unused=True))
         return (None, *(next(found) if need else None for need in needed))
@@ -46,6 +49,7 @@ def recomputed(function: Piece, *inputs: Tensor | None) -> tuple[Tensor, Tensor]
 
     Every tensor that needs a gradient must be among the inputs. Differentiable twice. Under tracing a plain call.
     """
-    if not is_traced() and torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs):
-        return _Recomputed.apply(function, *inputs)
-    return function(*inputs)
+    needed = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
+    if is_traced() or forward_ad._current_level >= 0 or not needed:  # forward-mode derivatives want every step
+        return function(*inputs)
+    return _Recomputed.apply(function, *inputs)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from lsmgeo._dtypes import computing_dtype, saturating_cast
 from lsmgeo.debugging import is_traced
 from lsmgeo.kernels.recompute import recomputed
 from lsmgeo.kernels.request import Options, Sites
@@ -31,23 +32,6 @@ SMALLEST_DEPTH = 2.0**-60
 def why_not(operator: str, source: Tensor, options: Options) -> str | None:
     """The reference runs everything."""
     return None
-
-
-def _computing_dtype(source: Tensor) -> torch.dtype:
-    return torch.float64 if source.dtype == torch.float64 else torch.float32
-
-
-def _to_output(values: Tensor, dtype: torch.dtype) -> Tensor:
-    """Cast, saturating: what is finite stays finite in half precision."""
-    if values.dtype == dtype:
-        return values
-    largest = torch.finfo(dtype).max
-    return values.clamp(-largest, largest).to(dtype)
-
-
-def _saturate(values: Tensor) -> Tensor:
-    largest = torch.finfo(values.dtype).max
-    return values.clamp(-largest, largest)
 
 
 # Geometry
@@ -96,7 +80,7 @@ def _extent(matrix: Tensor, reach: Sequence[Tensor]) -> Tensor:
 
 def _lattice_extent(matrix: Tensor, sites: Sites) -> Tensor:
     z = _per_view(sites.z.detach(), matrix).abs().amax(-1)
-    return _extent(matrix, (sites.x.abs().amax(), sites.y.abs().amax(), z))
+    return _extent(matrix, (sites.x.abs().amax(0), sites.y.abs().amax(0), z))
 
 
 def _point_extent(matrix: Tensor, points: Tensor) -> Tensor:
@@ -127,7 +111,7 @@ def _lattice_directions(sites: Sites, dtype: torch.dtype) -> Tensor:
     matrix = sites.direction / _power_of_two(sites.direction.detach().abs().amax((-1, -2)))[..., None, None]
     # Bounded plane by plane, so that the planes of a slab come out as those of the whole.
     z = _per_view(sites.z.detach(), matrix).abs()
-    terms = _extent(matrix[:, :, None], (sites.x.abs().amax(), sites.y.abs().amax(), z))[..., None, None]
+    terms = _extent(matrix[:, :, None], (sites.x.abs().amax(0), sites.y.abs().amax(0), z))[..., None, None]
     return _unit(_lattice_rows(matrix, sites, dtype), terms, sites.view_mask)
 
 
@@ -135,10 +119,32 @@ def _point_directions(
     direction: Tensor, points: Tensor, part: slice, view_mask: Tensor | None, dtype: torch.dtype
 ) -> Tensor:
     largest = direction.detach().abs().amax((-1, -2))
-    extent = _point_extent(direction, points)
-    scale = _power_of_two(torch.maximum(extent, largest / LARGEST_COORDINATE))
-    rows = _point_rows(direction / scale[..., None, None], points[:, part], dtype)
-    return _unit(rows, (extent / scale)[..., None], view_mask)
+    scale = _power_of_two(torch.maximum(_point_extent(direction, points), largest / LARGEST_COORDINATE))
+    matrix = direction / scale[..., None, None]
+    reach = [axis[:, None] for axis in points[:, part].detach().abs().unbind(-1)]  # (B, 1, N)
+    return _unit(_point_rows(matrix, points[:, part], dtype), _extent(matrix[:, :, None], reach), view_mask)
+
+
+def _nearby(points: Tensor) -> tuple[Tensor, Tensor]:
+    """A point amid those of each scene, (B, 3) float64, and the points as seen from there.
+
+    Applied to coordinates of a distant origin, float32 loses pixels; a matrix composed in float64 takes the origin in.
+    The point lies on a coarse lattice, so that no digit of a coordinate is lost, and is the origin where that is near.
+    """
+    double = points.double()
+    known = double.detach()
+    count = max(1, points.shape[1]) if isinstance(points.shape[1], int) else points.shape[1]
+    mean = known.sum(1) / count
+    spread = torch.cat((torch.zeros_like(mean[:, None]), (known - mean[:, None]).abs()), 1).amax((1, 2))[:, None]
+    step = _power_of_two(spread)
+    near = torch.where(spread > 0, torch.round(mean / step) * step, mean)
+    return near, double - near[:, None]
+
+
+def _moved(matrix: Tensor, near: Tensor) -> Tensor:
+    """The matrix (B, V, 3, 4) that acts on points as seen from `near` (B, 3)."""
+    shift = (matrix[..., :3] * near[:, None, None]).sum(-1, keepdim=True)
+    return torch.cat((matrix[..., :3], matrix[..., 3:] + shift), -1)
 
 
 def _power_of_two(value: Tensor) -> Tensor:
@@ -162,19 +168,21 @@ def _aligned(per_view: Tensor, dim: int) -> Tensor:
 def _coordinate(index: Tensor, size: int, options: Options) -> Tensor:
     """From an array index to `grid_sample`'s coordinate, ``(2 u + 1) / n - 1`` for ``align_corners=False``."""
     if options.mode == "nearest":
-        # The cell that contains the sample; grid_sample would round half to even.
-        index = torch.floor(index.detach() + 0.5)
+        # The cell that contains the sample; grid_sample would round half to even, and floor(u + 0.5) rounds the number
+        # just below 0.5 up.
+        cell = index.detach().floor()
+        index = cell + (index.detach() - cell >= 0.5)
     if options.padding_mode == "border":
         # No gradient at and beyond the outermost centres.
-        index = torch.where((index > 0) & (index < size - 1), index, index.detach().clamp(0, size - 1))
+        index = torch.where((index > 0) & (index < size - 1), index, index.detach().clamp(0.0, size - 1.0))
     else:
-        index = index.clamp(OUTSIDE, size + 1)  # all taps are outside there too; infinity would give NaN
-    coordinate = torch.add(index.new_tensor(1.0 / size - 1.0), index, alpha=2.0 / size)
+        index = index.clamp(OUTSIDE, size + 1.0)  # all taps are outside there too; infinity would give NaN
+    origin = torch.full((), 1.0 / size - 1.0, dtype=index.dtype, device=index.device)
+    coordinate = torch.add(origin, index, alpha=2.0 / size)
     # grid_sample undoes this with rounding errors of a few ulp. An index that is an integer must not fall into the cell
     # below, which it does not read and whose derivative it does not have.
     whole = index.detach()
-    on_center = (whole == whole.floor()).to(coordinate.dtype)
-    return torch.add(coordinate, on_center, alpha=4.0 * torch.finfo(index.dtype).eps)
+    return torch.add(coordinate, whole.floor().eq_(whole), alpha=4.0 * torch.finfo(index.dtype).eps)
 
 
 def _sample(source: Tensor, index: Sequence[Tensor], front: Tensor, options: Options) -> tuple[Tensor, Tensor]:
@@ -213,20 +221,13 @@ def _output(values: Tensor, depth: Tensor | None, direction: Tensor | None, dtyp
 
     What is finite stays finite: geometry saturates in every dtype, features where they are cast to a smaller one.
     """
-    blocks = [_cast(values, dtype)]
+    blocks = [saturating_cast(values, dtype)]
     if depth is not None:
         largest = torch.finfo(depth.dtype).max
-        blocks.append(_cast(depth.clamp(-largest, largest), dtype)[:, :, None])
+        blocks.append(saturating_cast(depth.clamp(-largest, largest), dtype)[:, :, None])
     if direction is not None:
-        blocks.append(_cast(direction, dtype))
+        blocks.append(saturating_cast(direction, dtype))
     return torch.cat(blocks, 2) if len(blocks) > 1 else blocks[0]
-
-
-def _cast(values: Tensor, dtype: torch.dtype) -> Tensor:
-    if values.dtype == dtype:
-        return values
-    largest = torch.finfo(dtype).max
-    return values.clamp(-largest, largest).to(dtype)
 
 
 def _sample_through_cameras(
@@ -269,7 +270,7 @@ def _over_pieces(
 
     def reduced(start: int, stop: int, *inputs: Tensor | None) -> tuple[Tensor, Tensor]:
         values, visible = piece(start, stop, *inputs)
-        return _cast(view_statistics(values, visible, options.reduce), dtype), visible
+        return saturating_cast(view_statistics(values, visible, options.reduce), dtype), visible
 
     if is_traced():  # no loop whose length depends on a size, no recomputation by hand
         return reduced(0, total, *inputs)
@@ -291,7 +292,7 @@ def unproject(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, T
     Returns:
         (B, V, C', D, H, W), or (B, C'', D, H, W) where options.reduce is set, and visibility (B, V, D, H, W).
     """
-    dtype, output = _computing_dtype(source), source.dtype
+    dtype, output = computing_dtype(source), source.dtype
     source = source.to(dtype)
     scale = _scale_below_overflow(_lattice_extent(sites.matrix, sites))[..., None]  # (B, V, 1)
 
@@ -318,8 +319,11 @@ def unproject_points(
     Returns:
         (B, V, C', N), or (B, C'', N) where options.reduce is set, and visibility (B, V, N).
     """
-    dtype, output = _computing_dtype(source), source.dtype
+    dtype, output = computing_dtype(source), source.dtype
     source = source.to(dtype)
+    near, points = _nearby(points)
+    matrix = _moved(matrix, near)
+    direction = None if direction is None else _moved(direction, near)
     scale = _scale_below_overflow(_point_extent(matrix, points))[..., None]  # (B, V, 1)
 
     def piece(
@@ -344,7 +348,7 @@ def sample_views(
     Returns:
         (B, V, C', N), or (B, C'', N) where options.reduce is set, and visibility (B, V, N).
     """
-    dtype, output = _computing_dtype(source), source.dtype
+    dtype, output = computing_dtype(source), source.dtype
     source = source.to(dtype)
 
     def piece(start: int, stop: int, source: Tensor, pixels: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
@@ -385,22 +389,25 @@ def plane_sweep_project(source: Tensor, sites: Sites, options: Options) -> tuple
     Returns:
         (B, V, C', P, h, w) and visibility (B, V, P, h, w).
     """
-    return _sweep(source.to(_computing_dtype(source)), sites, options, source.dtype)
+    return _sweep(source.to(computing_dtype(source)), sites, options, source.dtype)
 
 
-def project_reduce(source: Tensor, sites: Sites, weight: Tensor, options: Options) -> tuple[Tensor, Tensor]:
+def project_reduce(
+    source: Tensor, sites: Sites, weight: Tensor, bias: Tensor | None, options: Options
+) -> tuple[Tensor, Tensor]:
     """`plane_sweep_project` and a linear map of its stacked channels, a few planes at a time.
 
     Args:
         source: (B, C, D, H, W).
         sites: the views' frustums, P planes.
         weight: (O, C', P).
+        bias: (O,) or None.
         options: of the call.
 
     Returns:
         (B, V, O, h, w), and visibility (B, V, P, h, w).
     """
-    dtype = _computing_dtype(source)
+    dtype = computing_dtype(source)
     volume = source.to(dtype)
     total = sites.z.shape[-1]
     step = max(1, min(total // 8, 256 // max(1, weight.shape[1])))
@@ -422,7 +429,9 @@ def project_reduce(source: Tensor, sites: Sites, weight: Tensor, options: Option
         part, visible = recomputed(partial(piece, start, min(start + step, total)), *inputs)
         maps = maps + part
         seen.append(visible)
-    return _cast(maps, source.dtype), torch.cat(seen, 2)
+    if bias is not None:
+        maps = maps + bias.to(dtype)[:, None, None]
+    return saturating_cast(maps, source.dtype), torch.cat(seen, 2)
 
 
 OPERATORS: dict[str, Callable[..., Any]] = {

@@ -33,7 +33,8 @@ def view_statistics(values: Tensor, visible: Tensor, statistics: Sequence[str]) 
         if name == "mean":
             blocks.append(mean)
         elif name == "variance":
-            deviation = torch.where(seen, kept - mean[:, None], 0.0)
+            # Held where its square would overflow.
+            deviation = torch.where(seen, kept - mean[:, None], 0.0).clamp(-(largest**0.5), largest**0.5)
             blocks.append((deviation.square() * share[:, None]).sum(1).clamp(max=largest))
         else:
             # Indices of the first maximum, so that equal views do not share the gradient.

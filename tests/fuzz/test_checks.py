@@ -190,7 +190,7 @@ MISTAKES = {
     "grids of another number of scenes": (
         lambda: functional.unproject(FEATURES, VIEWS, VoxelGrid(2, world_from_grid=torch.eye(4).expand(3, 4, 4))),
         ShapeError,
-        "Unproject: grid must be of one scene or of B = 2; got 3 scenes",
+        "Unproject: grid must have one pose and one row of depths, or as many as scenes, B = 2; got 3",
     ),
     "volume of another grid": (
         lambda: sweep(grid=VoxelGrid((6, 4, 3))),

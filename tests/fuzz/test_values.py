@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import threading
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 import lsmgeo
-from lsmgeo import CameraTensors, cameras, depth_planes, functional
+from lsmgeo import CameraTensors, cameras, debugging, depth_planes, functional
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, GridError, ShapeError
 from tests.fuzz.calls import sweep, unproject, with_value
@@ -16,9 +17,17 @@ from tests.fuzz.positions import DEPTHS, FEATURES, GRID, MAP, MASK, VIEWS, B, V,
 
 
 class TestDebug:
-    """`debug` matters for tensors whose values a device would have to be waited for; "meta" stands for one here."""
+    """`debug` matters for tensors whose values a device would have to be waited for; one is played here."""
 
-    elsewhere = torch.ones(1, device="meta")
+    elsewhere = SimpleNamespace(device=torch.device("cuda"), is_meta=False)
+
+    @pytest.fixture(autouse=True)
+    def _plays_a_tensor(self, monkeypatch):
+        monkeypatch.setattr(debugging, "PLAIN", (*debugging.PLAIN, SimpleNamespace))
+
+    def test_what_holds_no_values_is_never_read(self):
+        with lsmgeo.debug():
+            assert not can_inspect(torch.ones(1, device="meta"))
 
     def test_values_are_read_on_the_cpu_and_in_the_context(self):
         assert can_inspect(torch.ones(1))

@@ -134,7 +134,9 @@ def _unit(change):
 
 
 def _voxel_lattice(change):
-    return around_method(grids.VoxelGrid, "world_from_lattice", lambda inner, self: change(self, inner(self)))
+    return around_method(
+        grids.VoxelGrid, "_world_from_lattice", lambda inner, self, device: change(self, inner(self, device))
+    )
 
 
 def _endpoints_included(grid, T):
@@ -148,15 +150,15 @@ def _first_scene(grid, T):
     return T[:1].expand_as(T) if T.dim() == 3 else T
 
 
-def _inverted_pose(inner, self):
+def _inverted_pose(inner, self, device):
     pose = self.world_from_grid
     if pose is None:
-        return inner(self)
+        return inner(self, device)
     other = object.__new__(grids.VoxelGrid)
     for name in ("shape", "lower", "upper"):
         object.__setattr__(other, name, getattr(self, name))
     object.__setattr__(other, "world_from_grid", torch.linalg.inv(pose))
-    return inner(other)
+    return inner(other, device)
 
 
 def _frustum_lattice(change):
@@ -325,7 +327,7 @@ FAULTS = {
     ),
     "outermost voxels on the bounds": _voxel_lattice(_endpoints_included),
     "grid axes in z, y, x order": _voxel_lattice(lambda g, T: T[..., [2, 1, 0, 3]]),
-    "grid pose inverted": around_method(grids.VoxelGrid, "world_from_lattice", _inverted_pose),
+    "grid pose inverted": around_method(grids.VoxelGrid, "_world_from_lattice", _inverted_pose),
     "first scene's grid for all": _voxel_lattice(_first_scene),
     "grid pose gets no gradient": _voxel_lattice(lambda g, T: T.detach()),
     "frustum planes in descending depth": _frustum_lattice(lambda g, lattice: lattice._replace(z=lattice.z.flip(-1))),
@@ -365,7 +367,7 @@ FAULTS = {
     # precision and gradients
     "matrices in bfloat16": image_matrix(lambda M, f: M.bfloat16().double()),
     "matrices in float32": image_matrix(lambda M, f: M.float().double()),
-    "float32 arithmetic for float64 features": around(reference._computing_dtype, lambda inner, source: torch.float32),
+    "float32 arithmetic for float64 features": around(reference.computing_dtype, lambda inner, source: torch.float32),
     "cameras get no gradient": image_matrix(lambda M, f: M.detach()),
     "features get no gradient": both(
         *(around(reference.OPERATORS[n], lambda inner, source, *a: inner(source.detach(), *a)) for n in BOTH)

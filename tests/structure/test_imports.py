@@ -21,15 +21,16 @@ MODULES = {
 }
 
 # Layers of the core, lowest first; a layer's modules import those named, and no others of the library.
-SHARED = {"errors", "_checks", "_linalg", "debugging"}
+SHARED = {"errors", "_checks", "_dtypes", "_linalg", "debugging"}
 MAY_IMPORT = {
     "errors": set(),
     "_checks": {"errors"},
+    "_dtypes": set(),
     "_linalg": set(),
     "debugging": set(),
     "cameras": SHARED | {"cameras"},
     "grids": SHARED | {"cameras"},
-    "kernels": {"errors", "_checks", "debugging", "kernels"},
+    "kernels": {"errors", "_checks", "_dtypes", "debugging", "kernels"},
     "_sites": SHARED | {"cameras", "grids", "kernels"},
     "functional": SHARED | {"cameras", "grids", "kernels", "_sites"},
     "layers": SHARED | {"functional", "grids", "kernels", "_sites"},

@@ -123,7 +123,7 @@ def test_documentation(value):
 def test_errors_are_also_built_in_errors():
     kinds = {
         "ShapeError": ValueError, "DTypeError": TypeError, "DeviceError": ValueError, "CameraError": ValueError,
-        "GridError": ValueError, "OptionError": ValueError, "BackendError": RuntimeError, "DataError": OSError,
+        "GridError": ValueError, "OptionError": ValueError, "BackendError": ValueError, "DataError": OSError,
     }  # fmt: skip
     for name, kind in kinds.items():
         assert issubclass(getattr(errors, name), kind)

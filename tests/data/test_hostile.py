@@ -7,6 +7,7 @@ import zlib
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
 
 from lsmgeo import data
 from lsmgeo.errors import DataError
@@ -168,7 +169,8 @@ def png_of(width, height, *, payload=b""):
     ("content", "match"),
     [
         (png_of(100_000, 100_000), "pixels|limit|exceeds"),
-        (png_of(5000, 5000), "limit"),
+        (png_of(8193, 8192), "limit is 67108864"),
+        (png_of(1 << 26, 2), "pixels|limit|exceeds"),
         (png_of(32, 24), "not a readable|truncated"),
         (b"GIF89a" + bytes(64), "not a readable"),
         (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 24\n", "not a readable"),
@@ -180,6 +182,28 @@ def test_pictures_are_checked(tmp_path, content, match):
     folder = write_middlebury(SCENE, tmp_path)
     (folder / "v1.png").write_bytes(content)
     refused(folder, match)
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        (png_of(100_000, 100_000), "pixels|limit|exceeds"),
+        (png_of(8193, 8192), "limit is 67108864"),
+        (png_of(8192, 8192), "its camera expects 32 x 24"),
+        (png_of(6048, 4032), "its camera expects 32 x 24"),
+    ],
+)
+def test_a_picture_of_another_size_is_refused_before_it_is_decoded(tmp_path, monkeypatch, content, match):
+    folder = write_colmap(SCENE, tmp_path, form="binary")
+    (folder / "images" / "v1.png").write_bytes(content)
+    scene = data.open(folder)
+
+    def load(self):
+        pytest.fail("a pixel is decoded")
+
+    monkeypatch.setattr(PngImageFile, "load", load)
+    with pytest.raises(DataError, match=match):
+        scene.load(scene.names.index("v1.png"))
 
 
 def test_a_sixteen_bit_picture_is_no_photograph(tmp_path):

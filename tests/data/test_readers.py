@@ -6,6 +6,7 @@ import torch
 from PIL import Image
 
 from lsmgeo import data
+from lsmgeo.data.files import image_size
 from lsmgeo.errors import DataError
 from tests.data.writers import make_scene, project, write_colmap, write_middlebury
 
@@ -80,6 +81,15 @@ def test_a_photograph_of_another_size_than_its_camera_is_refused(scene, tmp_path
         read.load(1)
 
 
+def test_a_photograph_of_24_megapixels_reads_back(tmp_path):
+    path = tmp_path / "photograph.jpg"
+    Image.new("RGB", (6048, 4032), (255, 255, 255)).save(path)
+    assert image_size(path) == (4032, 6048)
+    image = data.read_image(path, (4032, 6048))
+    assert image.shape == (4032, 6048, 3)
+    assert int(image[-1, -1].min()) == 255
+
+
 def test_a_point_cloud_reads_back_and_leaves_nothing_else(tmp_path):
     import trimesh
 
@@ -103,6 +113,20 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
         data.write_atomic(path, b"new and longer")
     assert path.read_bytes() == b"old"
     assert [file.name for file in tmp_path.iterdir()] == ["result"]
+
+
+@pytest.mark.parametrize("step", ["os.fdopen", "os.fsync", "pathlib.Path.chmod", "pathlib.Path.replace"])
+def test_an_interrupted_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch, step):
+    path = data.write_atomic(tmp_path / "result", b"old")
+    monkeypatch.setattr(step, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        data.write_atomic(path, b"new and longer")
+    assert path.read_bytes() == b"old"
+    assert [file.name for file in tmp_path.iterdir()] == ["result"]
+
+
+def interrupt(*_, **__):
+    raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize(

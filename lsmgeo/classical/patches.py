@@ -20,7 +20,7 @@ def patch_frames(cameras: CameraTensors, depth: float) -> Tensor:
     foreshortens a patch as the view does (a camera held upside down turns it by 180 degrees).
 
     Args:
-        cameras: leading shape (V,), the reference first.
+        cameras: leading shape (V,), the reference first; of the images in which the steps are taken, at their size.
         depth: camera z in the reference, world units.
 
     Returns:

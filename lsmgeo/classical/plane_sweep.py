@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -10,7 +11,7 @@ from torch.nn.functional import avg_pool2d, pad, unfold
 from tqdm import tqdm
 
 from lsmgeo import functional
-from lsmgeo.cameras import CameraTensors
+from lsmgeo.cameras import CameraTensors, resize
 from lsmgeo.classical.patches import patch_features, patch_frames
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import FrustumGrid
@@ -84,7 +85,7 @@ def sweep(
 
     Args:
         images: (V, 3, h, w) RGB in [0, 1], the reference first.
-        cameras: leading shape (V,), of images resized to (h, w) or of the originals.
+        cameras: leading shape (V,), of images resized to (h, w) or of the originals, which may differ in size.
         depths: (P,) ascending, P >= 3.
         window: side of the patches.
         aggregate: side of the square over which costs are averaged, odd.
@@ -105,6 +106,8 @@ def sweep(
         raise OptionError(f"sweep: depths must hold at least 3 planes; got {depths.shape[-1]}")
     if not 2 <= min_views <= views:
         raise OptionError(f"sweep: min_views must lie in 2..{views}, the number of views; got {min_views}")
+    # Patches take their steps in pixels of the images at hand, and every view may have been resized by its own factors.
+    cameras = resize(cameras, height, width)
     reference = CameraTensors(*(torch.as_tensor(value)[0] for value in cameras))
     grid = FrustumGrid(reference, depths, (height, width))
     middle = float((depths[0] * depths[-1]).sqrt())
@@ -132,7 +135,7 @@ def kept(depth_map: DepthMap, density: float, least: float = 0.0, specks: int = 
 
     Args:
         depth_map: from `sweep`.
-        density: largest fraction of all pixels to keep, in (0, 1].
+        density: largest fraction of all pixels to keep, in (0, 1]; among equals the first, row by row, are kept.
         least: confidence below which a pixel is never kept.
         specks: drop connected patches of kept pixels, without a jump in depth, that have fewer pixels than this.
 
@@ -153,9 +156,13 @@ def kept(depth_map: DepthMap, density: float, least: float = 0.0, specks: int = 
     if not 0 < density <= 1:
         raise OptionError(f"kept: density must lie in (0, 1]; got {density}")
     confidence = torch.where(depth_map.depth > 0, depth_map.confidence, 0.0)
-    number = max(1, round(density * confidence.numel()))
-    threshold = confidence.flatten().topk(number).values[-1]
-    mask = (confidence >= threshold) & (confidence > least)
+    # The margin keeps a product that is whole but for rounding: 0.29 * 100 is 28.999999999999996.
+    number = math.floor(density * confidence.numel() + 1e-6)
+    # A stable order, unlike topk's, is the same on every machine where confidences are equal.
+    best = confidence.flatten().sort(descending=True, stable=True).indices[:number]
+    mask = torch.zeros_like(confidence, dtype=torch.bool)
+    mask.view(-1)[best] = True
+    mask &= confidence > least
     return _without_specks(mask, depth_map.planes, specks) if specks > 1 else mask
 
 

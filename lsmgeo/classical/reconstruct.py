@@ -21,6 +21,8 @@ __all__ = ["Reconstruction", "SparseError", "points_of", "reconstruct_view", "sp
 # Confidence below which a pixel is never shown, however few there are: a winner without agreement around it.
 LEAST_CONFIDENCE = 0.1
 SPECK_FRACTION = 5e-4
+# As many as depth_planes makes.
+MOST_PLANES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -97,9 +99,11 @@ def reconstruct_view(
         OptionError: an option out of range, or no range or neighbours can be told.
         DataError: a photograph cannot be read.
     """
-    for name, number, least in (("neighbours", neighbours, 2), ("size", size, 16), ("planes", planes or 3, 3)):
-        if number < least:
+    for name, number, least in (("neighbours", neighbours, 2), ("size", size, 16), ("planes", planes, 3)):
+        if number is not None and number < least:
             raise OptionError(f"{name} must be at least {least}; got {number}")
+    if planes is not None and planes > MOST_PLANES:
+        raise OptionError(f"planes must be at most {MOST_PLANES}; got {planes}")
     if not 0 <= view < len(scene):
         raise OptionError(f"view must lie in 0..{len(scene) - 1}; got {view}")
     if not 0 < density <= 1:

@@ -12,6 +12,7 @@ from lsmgeo.classical.plane_sweep import slab_planes, sweep
 from lsmgeo.classical.views import common_point
 from lsmgeo.errors import OptionError
 from lsmgeo.functional import view_statistics
+from lsmgeo.grids import depth_planes
 from tests.data.writers import make_scene, write_colmap, write_middlebury
 
 
@@ -102,13 +103,22 @@ def _fits(memory):
     ("arguments", "message"),
     [
         (["--view", "9"], "view must lie in 0..4; got 9"),
+        (["--view", "99"], "view must lie in 0..4; got 99"),
+        (["--view=-1"], "view must lie in 0..4; got -1"),
         (["--view", "nobody.png"], "a photograph's name; got 'nobody.png'"),
         (["--density", "0"], "density must lie in"),
+        (["--density", "2"], "density must lie in (0, 1]; got 2.0"),
         (["--neighbours", "1"], "neighbours must be at least 2"),
         (["--size", "3"], "size must be at least 16"),
+        (["--size", "0"], "size must be at least 16; got 0"),
         (["--planes", "2"], "planes must be at least 3"),
-        (["--near", "3", "--far", "2"], "near and far must be positive"),
+        (["--planes", "0"], "planes must be at least 3; got 0"),
+        (["--planes", "99999999999"], "planes must be at most 1048576; got 99999999999"),
+        (["--near", "3", "--far", "1"], "near and far must be positive, finite and ascending; got 3.0 and 1.0"),
+        (["--near", "-1"], "near and far must be positive"),
+        (["--far", ".inf"], "near and far must be positive"),
         (["--memory", "1"], "memory must be at least"),
+        (["--memory", "-5"], "memory must be at least"),
     ],
 )
 def test_wrong_options_give_one_line_and_status_2(folder, tmp_path, capsys, arguments, message):
@@ -118,6 +128,28 @@ def test_wrong_options_give_one_line_and_status_2(folder, tmp_path, capsys, argu
     assert message in captured.err
     assert captured.err.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "lsmgeo.classical.reconstruct.sweep",
+        "lsmgeo.classical.pictures.coloured_depth",
+        "lsmgeo.classical.pictures.summary",
+        "os.fsync",
+    ],
+)
+def test_an_interrupt_leaves_no_file(scene, tmp_path, monkeypatch, capsys, place):
+    folder = write_middlebury(scene, tmp_path / "scene")
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(place, interrupt)
+    out = tmp_path / "out"
+    assert cli.main(["reconstruct", str(folder), "--planes", "8", "--out", str(out)]) == 130
+    assert capsys.readouterr().err.endswith("lsmgeo: interrupted\n")
+    assert list(out.rglob("*")) == []
 
 
 def test_a_missing_scene_gives_one_line_and_status_2(tmp_path, capsys):
@@ -178,6 +210,64 @@ def test_patch_frames_turn_with_the_camera(scene, tmp_path):
     torch.testing.assert_close(frames[0], torch.eye(2, dtype=torch.float64))
     assert float(frames[2].diagonal().max()) < -0.8  # upside down
     assert float(frames[1].diagonal().min()) > 0.8
+
+
+def test_cameras_of_the_originals_give_what_resized_ones_give(scene, tmp_path):
+    """Originals twice as large, half as large and stretched, all brought to one size."""
+    read = data.open(write_middlebury(scene, tmp_path))
+    images = torch.stack([read.load(index) for index in range(5)])
+    scale_y, scale_x = np.array([1, 2, 0.5, 4, 1]), np.array([1, 2, 0.5, 1, 2])
+    K = scene.K.copy()
+    K[:, 0] *= scale_x[:, None]
+    K[:, 1] *= scale_y[:, None]
+    # The same area is tiled: the centre of pixel 0 lies half a pixel inside the border at every size.
+    K[:, 0, 2] += 0.5 * scale_x - 0.5
+    K[:, 1, 2] += 0.5 * scale_y - 0.5
+    originals = read.cameras._replace(
+        intrinsics=torch.from_numpy(K), height=torch.from_numpy(72 * scale_y).long(),
+        width=torch.from_numpy(96 * scale_x).long()
+    )  # fmt: skip
+    depths = depth_planes(1.5, 2.6, 40, spacing="inverse")
+    expected = sweep(images, read.cameras, depths)
+    torch.testing.assert_close(sweep(images, originals, depths).depth, expected.depth, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(sweep(images, originals, depths).cost, expected.cost, rtol=1e-4, atol=1e-4)
+    plain = sweep(images, read.cameras._replace(height=72, width=96), depths)
+    torch.testing.assert_close(plain.depth, expected.depth, rtol=0, atol=0)
+    check_depth((expected.depth * kept(expected, 0.4)).numpy(), scene.depth[0])
+
+
+@pytest.mark.parametrize("folder_size", [(144, 192), (108, 72)])
+def test_photographs_of_several_sizes_are_matched(scene, tmp_path, folder_size):
+    """Some of the photographs are stored at another size, with the cameras that belong to it."""
+    height, width = folder_size
+    read = data.open(write_middlebury(scene, tmp_path))
+    lines = (tmp_path / "scene_par.txt").read_text().splitlines()
+    for view in (1, 3):
+        with Image.open(read.paths[view]) as picture:
+            resized = picture.resize((width, height), Image.Resampling.BICUBIC)
+        resized.save(read.paths[view])
+        index = next(index for index, line in enumerate(lines) if line.startswith(f"{read.names[view]} "))
+        name, *numbers = lines[index].split()
+        S = np.array([[width / 96, 0, 0.5 * width / 96 - 0.5], [0, height / 72, 0.5 * height / 72 - 0.5], [0, 0, 1]])
+        K = S @ np.array(numbers[:9], dtype=float).reshape(3, 3)
+        lines[index] = " ".join([name, *(repr(float(x)) for x in K.ravel()), *numbers[9:]])
+    (tmp_path / "scene_par.txt").write_text("\n".join(lines) + "\n")
+    result = reconstruct_view(data.open(tmp_path), 0, size=96)
+    assert set(result.neighbours) & {1, 3}
+    check_depth(torch.where(result.mask, result.depth_map.depth, 0.0).numpy(), scene.depth[0])
+
+
+@pytest.mark.parametrize(("density", "expected"), [(0.25, 16), (0.29, 18), (0.999, 63), (1.0, 64), (0.01, 0)])
+def test_never_more_pixels_are_kept_than_the_density_allows(density, expected):
+    depth_map = DepthMap(torch.ones(8, 8), torch.full((8, 8), 0.5), torch.zeros(8, 8), torch.full((8, 8), 5.0))
+    mask = kept(depth_map, density)
+    assert int(mask.sum()) == expected
+    assert bool(mask.flatten()[:expected].all())  # among equals the first
+
+
+def test_a_density_that_is_whole_but_for_rounding_is_whole():
+    tied = torch.full((10, 10), 0.5)
+    assert int(kept(DepthMap(tied, tied, tied, tied), 0.29).sum()) == 29
 
 
 def test_kept_pixels_are_the_best_and_specks_go():

@@ -181,7 +181,7 @@ def _run(arguments: Sequence[str] | None) -> None:
 
 def _reason(message: str) -> str:
     """What the parser of the arguments says over several lines, in one."""
-    found = re.match(r'Parser key "(.+?)":(.*?)(?:Given value type:.*?Given|Got) value: (.*)', message, re.DOTALL)
+    found = re.match(r'Parser key "(.+?)":(.*?)(?:Given value type:.*?Given|Got) value: ([^\n]*)', message, re.DOTALL)
     if found:
         name, expected, value = found.groups()
         choices = re.search(r"Literal\[(.*?)\]", expected)
@@ -189,7 +189,7 @@ def _reason(message: str) -> str:
         if choices or kinds:
             wanted = f"one of {choices[1]}" if choices else " or ".join(kinds)
             message = f"{name} must be {wanted}; got {value!r}"
-    message = " ".join(message.split())
+    message = re.sub(r'^Parser key "(.+?)":', r"\1:", " ".join(message.split()))
     return message if len(message) <= LONGEST_MESSAGE else f"{message[:LONGEST_MESSAGE]} ..."
 
 

@@ -1,5 +1,6 @@
 """``lsmgeo demo`` and what the command line does before a command runs."""
 
+import re
 import subprocess
 import sys
 
@@ -54,12 +55,63 @@ def test_questions_about_the_command_end_well(arguments, capsys):
     assert "lsmgeo" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("arguments", [[], ["dance"], ["reconstruct"], ["reconstruct", ".", "--method", "guess"]])
-def test_a_wrong_command_ends_with_status_2(arguments, capsys):
-    with pytest.raises(SystemExit) as caught:
-        cli.main(arguments)
-    assert caught.value.code == 2
-    assert "error" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], '"subcommand" to be one of {demo,reconstruct}'),
+        (["dance"], "invalid choice: 'dance'"),
+        (["--dance"], "unrecognized arguments: --dance"),
+        (["demo", "--dance", "3"], "unrecognized arguments: --dance 3"),
+        (["demo", "--out"], "--out: expected one argument"),
+        (["demo", "--config", "nowhere.yaml"], "config: .*nowhere.yaml'"),
+        (["reconstruct"], "required: .*scene"),
+        (["reconstruct", ".", "more"], "unrecognized arguments: more"),
+        (["reconstruct", ".", "--dens", "0.3"], "unrecognized arguments: --dens"),
+        (["reconstruct", ".", "--method", "guess"], "method must be one of 'sweep'; got 'guess'"),
+        (["reconstruct", ".", "--depth_format", "jpg"], "depth_format must be one of 'npy', 'png'; got 'jpg'"),
+        (["reconstruct", ".", "--size", "1.5"], "size must be a whole number; got '1.5'"),
+        (["reconstruct", ".", "--planes", "many"], "planes must be a whole number; got 'many'"),
+        (["reconstruct", ".", "--density", "x"], "density must be a finite number; got 'x'"),
+        (["reconstruct", ".", "--near", "nan"], "near must be a finite number; got 'nan'"),
+        (["reconstruct", ".", "--far", "two\nlines"], "far must be a finite number; got 'two"),
+    ],
+)
+def test_a_wrong_command_gives_one_line_and_status_2(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert re.match(f"lsmgeo: error: .*({message}).*\n$", captured.err), captured.err
+    assert len(captured.err) < 400
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_configuration_that_is_none_is_not_printed_whole(tmp_path, capsys):
+    (tmp_path / "notes").write_text("a line\n" * 1000)
+    assert cli.main(["--config", str(tmp_path / "notes"), "demo"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert len(error) < 400
+
+
+def test_the_installed_command_has_these_statuses(tmp_path):
+    code = "import sys; from lsmgeo.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, "reconstruct", "/nonexistent"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "lsmgeo: error: /nonexistent: no such folder\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_demo_leaves_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("lsmgeo.demo.run_demo", interrupt)
+    assert cli.main(["demo", "--out", str(tmp_path / "out")]) == 130
+    assert capsys.readouterr().err == "lsmgeo: interrupted\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def interrupt(*_, **__):
+    raise KeyboardInterrupt
 
 
 def test_importing_the_command_line_is_light():

@@ -24,17 +24,18 @@ def transform(matrix: Tensor, vector: Tensor) -> Tensor:
 
 def cross(left: Tensor, right: Tensor) -> Tensor:
     """Cross product over the last axis, broadcasting."""
-    a, b, c = left.unbind(-1)
+    a, b, c = left.unbind(-1)  # torch.linalg.cross has no rule for vmap
     d, e, f = right.unbind(-1)
     return torch.stack((b * f - c * e, c * d - a * f, a * e - b * d), -1)
 
 
 def inverse_3x3(matrix: Tensor) -> Tensor:
     """Inverse of (..., 3, 3) as the adjugate over the determinant: differentiable, and exact where a solver is not."""
-    first, second, third = matrix.unbind(-2)
-    adjugate = torch.stack((cross(second, third), cross(third, first), cross(first, second)), -1)  # (..., 3, 3)
-    determinant = (first * adjugate[..., :, 0]).sum(-1)
-    return adjugate / determinant[..., None, None]
+    # With cyclic indices, cofactor (i, j) is m[i+1, j+1] m[i+2, j+2] - m[i+1, j+2] m[i+2, j+1].
+    one, two = matrix.roll(-1, -2), matrix.roll(-2, -2)
+    cofactors = one.roll(-1, -1) * two.roll(-2, -1) - one.roll(-2, -1) * two.roll(-1, -1)
+    determinant = (matrix[..., 0, :] * cofactors[..., 0, :]).sum(-1)
+    return cofactors.transpose(-1, -2) / determinant[..., None, None]
 
 
 def homogeneous_row(rows: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from kornia.geometry.conversions import (
 from torch import Tensor
 
 from lsmgeo._checks import check_broadcast, check_choice, check_devices, check_flag, check_geometry, check_size
-from lsmgeo._linalg import homogeneous_row, transform
+from lsmgeo._linalg import homogeneous_row, multiply, transform
 from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, check_cameras, image_sizes
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, ShapeError
@@ -120,8 +120,8 @@ def from_opencv(
 
     Args:
         intrinsics: (..., 3, 3) in pixels.
-        rotation: (..., 3, 3) matrices, or (..., 3) axis-angle vectors (``rvec``, radians); what ends in (3, 3) is taken
-            for matrices.
+        rotation: (..., 3, 3) matrices, or (..., 3) axis-angle vectors (``rvec``, radians). What ends in (3, 3) is taken
+            for vectors where it has the translation's shape, as three pairs of rvec and tvec have, else for matrices.
         translation: (..., 3), world units.
         height: image height in pixels, an int or (...).
         width: image width in pixels, an int or (...).
@@ -144,12 +144,21 @@ def from_opencv(
     who = "from_opencv"
     K = _matrix(who, "intrinsics", intrinsics, 3, 3)
     check_geometry(who, "rotation", rotation, "(..., 3) or (..., 3, 3)")
-    if tuple(rotation.shape[-2:]) == (3, 3):
+    t = _matrix(who, "translation", translation, 3)
+    looks_like_matrices = tuple(rotation.shape[-2:]) == (3, 3)
+    if looks_like_matrices and rotation.shape == t.shape and can_inspect(rotation):
+        turned = multiply(rotation, rotation.transpose(-1, -2)) - torch.eye(3, dtype=rotation.dtype)
+        if bool((turned.abs() <= 1e-3).all()):
+            raise CameraError(
+                f"{who}: rotation must not be three vectors and a matrix at once; expand matrices to the translation's "
+                f"leading shape; got {tuple(rotation.shape)} and {tuple(t.shape)}"
+            )
+    if looks_like_matrices and rotation.shape != t.shape:
         R = rotation
     else:
         vectors = _matrix(who, "rotation", rotation, 3)
         R = axis_angle_to_rotation_matrix(vectors.reshape(-1, 3)).reshape(*vectors.shape[:-1], 3, 3)
-    return _made(who, K, R, _matrix(who, "translation", translation, 3), height, width, pixel_center)
+    return _made(who, K, R, t, height, width, pixel_center)
 
 
 def to_opencv(cameras: Cameras, *, pixel_center: str = "integer") -> OpenCVCameras:

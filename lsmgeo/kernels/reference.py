@@ -177,12 +177,12 @@ def _coordinate(index: Tensor, size: int, options: Options) -> Tensor:
         index = torch.where((index > 0) & (index < size - 1), index, index.detach().clamp(0.0, size - 1.0))
     else:
         index = index.clamp(OUTSIDE, size + 1.0)  # all taps are outside there too; infinity would give NaN
-    origin = torch.full((), 1.0 / size - 1.0, dtype=index.dtype, device=index.device)
-    coordinate = torch.add(origin, index, alpha=2.0 / size)
     # grid_sample undoes this with rounding errors of a few ulp. An index that is an integer must not fall into the cell
-    # below, which it does not read and whose derivative it does not have.
+    # below, which it does not read and whose derivative it does not have: a nudge lifts it over them.
+    origin = torch.full((), 1.0 / size - 1.0, dtype=index.dtype, device=index.device)
     whole = index.detach()
-    return torch.add(coordinate, whole.floor().eq_(whole), alpha=4.0 * torch.finfo(index.dtype).eps)
+    start = torch.where(whole == whole.floor(), origin + 4.0 * torch.finfo(index.dtype).eps, origin)
+    return torch.add(start, index, alpha=2.0 / size)
 
 
 def _sample(source: Tensor, index: Sequence[Tensor], front: Tensor, options: Options) -> tuple[Tensor, Tensor]:

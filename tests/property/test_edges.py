@@ -11,7 +11,7 @@ from torch.autograd import forward_ad
 from lsmgeo import FrustumGrid, PlaneSweepProject, VoxelGrid, depth_planes, functional, rays
 from lsmgeo.cameras import CameraTensors, crop, from_opencv, orbit, to
 from lsmgeo.cameras import rays as camera_rays
-from lsmgeo.errors import DeviceError, DTypeError, ShapeError
+from lsmgeo.errors import CameraError, DeviceError, DTypeError, ShapeError
 
 VIEWS = orbit(torch.tensor([[0.0, 40.0]]), 10.0, 2.0, focal_length=50.0, height=24, width=32)
 FEATURES = torch.rand(1, 2, 3, 12, 16, generator=torch.Generator().manual_seed(0))
@@ -151,3 +151,13 @@ def test_grids_without_values_are_refused():
     frustum = FrustumGrid(camera, depth_planes(1.0, 3.0, 4).to("meta"), (3, 4))
     with pytest.raises(DeviceError, match="must hold values"):
         functional.unproject(FEATURES, VIEWS, frustum)
+
+
+def test_three_rotation_vectors_are_no_matrix():
+    K = torch.tensor([[50.0, 0.0, 3.0], [0.0, 50.0, 4.0], [0.0, 0.0, 1.0]])
+    quarter = torch.pi / 2 * torch.eye(3)
+    three = from_opencv(K, quarter, torch.zeros(3, 3), 24, 32)
+    expected = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # a quarter turn about x
+    torch.testing.assert_close(three.cam_from_world[0, :3, :3], expected, rtol=0, atol=1e-6)
+    with pytest.raises(CameraError, match="rotation must not be three vectors and a matrix at once"):
+        from_opencv(K, torch.eye(3), torch.zeros(3, 3), 24, 32)

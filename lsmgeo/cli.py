@@ -172,7 +172,7 @@ def _run(arguments: Sequence[str] | None) -> None:
         as_positional=True,
         prog="lsmgeo",
         version=release,
-        description="Features between images and 3D space.",
+        description="Plane-sweep depth from posed photographs, and a demonstration on a known scene.",
         # Errors come here, to become one line; and an option is what it is called, not how its name begins.
         exit_on_error=False,
         allow_abbrev=False,

@@ -80,7 +80,8 @@ def unproject(
         grid: `VoxelGrid`, or the `FrustumGrid` of a reference camera; its (D, H, W) sites.
         view_mask: (B, V) bool; views where it is False give zeros, and neither features nor camera are read.
         mode: "bilinear", or "nearest": the pixel that contains the sample.
-        padding_mode: "zeros" (fades within the outer half pixel; with `reduce`, prefer "border") or "border".
+        padding_mode: "zeros" (fades from the outermost centres to one pixel out; with `reduce`, prefer "border") or
+            "border".
         augment: "depth" and "direction": append the camera depth, then the unit ray direction (x, y, z), also at
             invisible sites of views that are not masked.
         direction_frame: "world" or "camera".

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -176,6 +177,8 @@ def _grid_shape(who: str, value: object) -> tuple[int, int, int]:
 def _bounds(name: str, value: object) -> tuple[float, float, float]:
     if isinstance(value, Tensor):
         raise DTypeError(f"VoxelGrid: {name} must be numbers (gradients go to world_from_grid); got {describe(value)}")
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
     values = tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else (value,) * 3
     if len(values) != 3:
         raise GridError(f"VoxelGrid: {name} must be a number or (x, y, z); got {describe(value)}")
@@ -252,7 +255,9 @@ class FrustumGrid:
         camera = as_tensors(self.camera, who)
         leading = tuple(camera.cam_from_world.shape[:-2])
         if len(leading) > 1:
-            raise ShapeError(f"{who}: camera must have leading shape () or (B,), one a scene; got {leading}")
+            raise ShapeError(
+                f"{who}: camera must have leading shape () or (B,), one a scene (see cameras.select); got {leading}"
+            )
         check_cameras(who, camera)
         check_depths(who, self.depths)
         if leading and self.depths.dim() == 2 and self.depths.shape[0] != leading[0]:

@@ -14,13 +14,12 @@ from lsmgeo.cameras.converters import (
     to_opengl,
     to_pytorch3d,
 )
-from lsmgeo.cameras.tensors import CameraTensors, as_tensors, check_cameras, stack, to
+from lsmgeo.cameras.tensors import CameraTensors, as_tensors, select, stack, to
 from lsmgeo.cameras.transforms import crop, look_at, orbit, perturb, rays, resize
 
 __all__ = [
     "CameraTensors",
     "as_tensors",
-    "check_cameras",
     "crop",
     "from_colmap",
     "from_opencv",
@@ -31,6 +30,7 @@ __all__ = [
     "perturb",
     "rays",
     "resize",
+    "select",
     "stack",
     "to",
     "to_colmap",

@@ -14,11 +14,11 @@ from lsmgeo._linalg import multiply
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, DTypeError, ShapeError
 
-__all__ = ["CameraTensors", "Cameras", "as_tensors", "check_cameras", "image_sizes", "stack", "to"]
+__all__ = ["CameraTensors", "Cameras", "as_tensors", "check_cameras", "image_sizes", "select", "stack", "to"]
 
 
 class CameraTensors(NamedTuple):
-    """Pinhole cameras as four tensors: a pytree, so it goes through export, vmap and data loaders.
+    """Pinhole cameras as four tensors: a pytree, so it goes through export, vmap and data loaders (sizes as tensors).
 
     Convention:
         ``x ~ K (R X + t)`` with OpenCV axes (x right, y down, z forward), world-to-camera extrinsics and integer pixel
@@ -28,8 +28,8 @@ class CameraTensors(NamedTuple):
         intrinsics: (..., 3, 3) calibration matrices K in pixels, last row (0, 0, 1), skew allowed; of a 4x4 matrix the
             top-left 3x3 counts. float32 or float64.
         cam_from_world: (..., 4, 4) rigid world-to-camera transforms ``[[R, t], [0, 0, 0, 1]]``, of the same dtype.
-        height: (...) image heights in pixels, or one int for all.
-        width: (...) image widths in pixels, or one int for all.
+        height: (...) image heights in pixels, (B,) where views share them, or one int for all.
+        width: (...) image widths in pixels, likewise.
 
     The leading shape is (B, V) where an operator takes V views of B scenes (or (B*V,), view fastest), and (B,) or ()
     where one camera a scene is meant.
@@ -85,10 +85,7 @@ def as_tensors(cameras: Cameras, who: str = "cameras") -> CameraTensors:
         DeviceError: tensors on different devices.
     """
     if isinstance(cameras, PinholeCamera):
-        height, width = cameras.height, cameras.width
-        if cameras.intrinsics.dim() == 4 and height.dim() == 1:  # (B, V, 4, 4): the views share (B,) sizes
-            height, width = (size[:, None].expand(cameras.intrinsics.shape[:2]) for size in (height, width))
-        cameras = CameraTensors(cameras.intrinsics, cameras.extrinsics, height, width)
+        cameras = CameraTensors(cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
     elif not isinstance(cameras, CameraTensors):
         raise DTypeError(
             f"{who}: cameras must be a kornia PinholeCamera, a PinholeCamerasList or lsmgeo.cameras.CameraTensors; "
@@ -138,6 +135,8 @@ def _size(who: str, name: str, value: Any, leading: tuple[int, ...], like: Tenso
         or value.layout != torch.strided
     ):
         raise DTypeError(f"{who}: cameras.{name} must be an int or a dense real tensor; got {describe(value)}")
+    if len(leading) == 2 and tuple(value.shape) == leading[:1]:  # shared by the views of a scene
+        value = value[:, None].expand(leading)
     if tuple(value.shape) != leading:
         raise ShapeError(
             f"{who}: cameras.{name} must have the cameras' leading shape {leading}; got {tuple(value.shape)}"
@@ -226,6 +225,36 @@ def stack(cameras: Sequence[Cameras], dim: int = 0) -> CameraTensors:
     check_devices("stack", **{f"cameras[{i}]": part.intrinsics for i, part in enumerate(parts)})
     fields = (torch.stack([torch.as_tensor(field) for field in column], dim) for column in zip(*parts, strict=True))
     return CameraTensors(*fields)
+
+
+def select(cameras: Cameras, dim: int, index: int) -> CameraTensors:
+    """One camera along a leading axis, as ``torch.select`` does; the inverse of `stack`.
+
+    Args:
+        cameras: at least one leading axis; of (B, V) cameras ``select(cameras, 1, 0)`` is the first view of each scene.
+        dim: the axis that goes, 0 to the number of leading axes less 1.
+        index: which camera.
+
+    Returns:
+        `CameraTensors` without that axis.
+
+    Raises:
+        ShapeError: no such axis, or no such camera.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.cameras import orbit, select
+        >>> views = orbit(torch.zeros(2, 3), 10.0, 2.0, focal_length=50.0, height=48, width=64)
+        >>> tuple(select(views, 1, 0).intrinsics.shape)
+        (2, 3, 3)
+    """
+    tensors = as_tensors(cameras, "select")
+    leading = tuple(tensors.cam_from_world.shape[:-2])
+    if not isinstance(dim, int) or isinstance(dim, bool) or not 0 <= dim < len(leading):
+        raise ShapeError(f"select: dim must be a leading axis of {leading}; got {describe(dim)}")
+    if not isinstance(index, int) or isinstance(index, bool) or not -leading[dim] <= index < leading[dim]:
+        raise ShapeError(f"select: index must be one of {leading[dim]} cameras; got {describe(index)}")
+    return CameraTensors(*(torch.as_tensor(field).select(dim, index) for field in tensors))
 
 
 def to(

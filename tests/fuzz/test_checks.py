@@ -220,7 +220,7 @@ MISTAKES = {
     "frustums of two axes": (
         lambda: FrustumGrid(VIEWS, DEPTHS),
         ShapeError,
-        "FrustumGrid: camera must have leading shape () or (B,), one a scene; got (2, 3)",
+        "FrustumGrid: camera must have leading shape () or (B,), one a scene (see cameras.select); got (2, 3)",
     ),
     "size of one number": (
         lambda: sweep(size=(8,)),

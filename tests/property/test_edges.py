@@ -9,7 +9,7 @@ import torch
 from torch.autograd import forward_ad
 
 from lsmgeo import FrustumGrid, PlaneSweepProject, VoxelGrid, depth_planes, functional, rays
-from lsmgeo.cameras import CameraTensors, crop, from_opencv, orbit, to
+from lsmgeo.cameras import CameraTensors, crop, from_opencv, orbit, select, to
 from lsmgeo.cameras import rays as camera_rays
 from lsmgeo.errors import CameraError, DeviceError, DTypeError, ShapeError
 
@@ -161,3 +161,17 @@ def test_three_rotation_vectors_are_no_matrix():
     torch.testing.assert_close(three.cam_from_world[0, :3, :3], expected, rtol=0, atol=1e-6)
     with pytest.raises(CameraError, match="rotation must not be three vectors and a matrix at once"):
         from_opencv(K, torch.eye(3), torch.zeros(3, 3), 24, 32)
+
+
+def test_sizes_shared_by_the_views_and_a_selected_view():
+    scenes = orbit(torch.zeros(2, 3), 10.0, 2.0, focal_length=50.0, height=24, width=32)
+    shared = scenes._replace(height=torch.tensor([24, 12]), width=torch.tensor([32, 32]))
+    lone = select(shared, 0, 1)
+    torch.testing.assert_close(lone.height, torch.tensor([12, 12, 12]))
+    reference = select(shared, 1, 2)
+    torch.testing.assert_close(reference.height, torch.tensor([24, 12]))
+    torch.testing.assert_close(reference.intrinsics, shared.intrinsics[:, 2], rtol=0, atol=0)
+    with pytest.raises(ShapeError, match="index must be one of 3 cameras; got int 3"):
+        select(shared, 1, 3)
+    with pytest.raises(ShapeError, match="dim must be a leading axis"):
+        select(shared, 2, 0)

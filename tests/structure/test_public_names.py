@@ -24,7 +24,7 @@ INVENTORY = {
     cameras: {
         "CameraTensors", "crop", "from_colmap", "from_opencv", "from_opengl", "from_pytorch3d", "look_at", "orbit",
         "perturb", "rays", "resize", "stack", "to", "to_colmap", "to_opencv", "to_opengl", "to_pytorch3d", "as_tensors",
-        "check_cameras",
+        "select",
     },
     grids: {"FrustumGrid", "Lattice", "VoxelGrid", "depth_planes"},
     layers: {"PlaneSweepProject", "Unproject"},
@@ -89,7 +89,7 @@ def public_functions():
         for name in module.__all__:
             value = getattr(module, name)
             own = inspect.isfunction(value) or (inspect.isclass(value) and not hasattr(value, "_fields"))
-            if own and name not in ("as_tensors", "check_cameras"):
+            if own and name != "as_tensors":
                 yield pytest.param(value, id=f"{module.__name__}.{name}")
     yield pytest.param(kernels.explain, id="lsmgeo.kernels.explain")
     yield pytest.param(lsmgeo.debug, id="lsmgeo.debug")

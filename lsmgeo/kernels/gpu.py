@@ -1,0 +1,588 @@
+"""The Triton backend: tables for the kernels, their launch, and the small matrices' share of the gradients.
+
+Tensors in, tensors out, no autograd. Triton is imported at the first call. Everything of the size of the sites is done
+in one launch; what PyTorch does here is of the size of the matrices and the axes, in float64.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import os
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lsmgeo._dtypes import saturating_cast
+from lsmgeo.kernels import reference
+from lsmgeo.kernels.request import Options, Sites
+
+__all__ = [
+    "images",
+    "images_backward",
+    "pixels",
+    "pixels_backward",
+    "volume",
+    "volume_backward",
+    "why_not",
+]
+
+TILE = 2048  # elements, 16 for each thread of four warps
+SITES = (16, 256)  # of a tile
+CHANNELS = (4, 64)
+PLANES = 32  # 128 bytes of float32
+
+
+def why_not(operator: str, source: Tensor, options: Options) -> str | None:
+    """Why these kernels cannot run a call; None if they can."""
+    if source.dtype == torch.float64:
+        return "float64 stays on the reference path"
+    if importlib.util.find_spec("triton") is None:
+        return "Triton is not installed"
+    if source.device.type != "cuda" and not (source.device.type == "cpu" and _is_interpreted()):
+        return f"its kernels are for CUDA tensors, these are on {source.device.type} (or TRITON_INTERPRET=1, to debug)"
+    return None
+
+
+def _is_interpreted() -> bool:
+    return os.environ.get("TRITON_INTERPRET", "").lower() in ("1", "true", "on", "yes", "y")
+
+
+def _kernels() -> tuple[ModuleType, ModuleType]:
+    from lsmgeo.kernels import gpu_gradients, gpu_kernels
+
+    return gpu_kernels, gpu_gradients
+
+
+# What a launch is made of
+
+
+class _Call(NamedTuple):
+    """What both kernels are launched with."""
+
+    lattice: Any
+    points: Any
+    sizes: Any
+    how: Any
+    near: float
+    programs: int
+    views: int  # B V
+
+
+def _call(
+    source: Tensor,
+    target: Tensor,
+    options: Options,
+    extras: int,
+    lattice: _Tables | None = None,
+    points: Sequence[Tensor | None] = (None, None, None),
+    volume: bool = False,
+    needs: tuple[bool, bool] = (False, False),
+) -> _Call:
+    """Plan a launch.
+
+    Args:
+        source: (B, V, C, d, h, w).
+        target: values or their gradient: (B, V, C', D, H, W), or (B, 1, C'', D, H, W).
+        options: of the call.
+        extras: number of geometric channels.
+        lattice: tables of the sites, or
+        points: pixels, front and given channels.
+        volume: whether the sites are those of frustums.
+        needs: whether the source's gradient is needed, and that of the geometry.
+    """
+    kernels, _ = _kernels()
+    views, channels = source.shape[1:3]
+    planes, height, width = target.shape[3:]
+    # Along the axis that is the fastest in memory, a store is one transaction.
+    fast = planes > 1 and 0 < target.stride(3) < max(target.stride(5), target.stride(4))
+    run = min(PLANES, _power_of_two(planes)) if fast else 1
+    columns = _within(_power_of_two(channels), CHANNELS)
+    block = max(run, _within(TILE // columns, SITES))
+    tiles, slabs = max(1, -(-channels // columns)), -(-planes // run)
+    blocks = -(-height * width // (block // run))
+    blocks_of = {name: place for place, name in enumerate(options.reduce)}
+    how = kernels.How(
+        kind=2 if lattice is None else int(volume),
+        nearest=options.mode == "nearest",
+        border=options.padding_mode == "border",
+        projective=lattice is not None and lattice.projective,
+        depth=options.depth,
+        direction=bool(options.direction),
+        extras=extras,
+        reduce=bool(options.reduce),
+        mean=blocks_of.get("mean", -1),
+        variance=blocks_of.get("variance", -1),
+        maximum=blocks_of.get("max", -1),
+        largest=torch.finfo(target.dtype).max,
+        sites=block,
+        planes=run,
+        channels=columns,
+        width=_power_of_two(extras),
+        corners=1 if options.mode == "nearest" else 8 if volume else 4,
+        needs_source=needs[0],
+        needs_geometry=needs[1],
+    )
+    cells = source.shape[3:]
+    return _Call(
+        kernels.Lattice(*(None,) * 5) if lattice is None else kernels.Lattice(*lattice[:5]),
+        kernels.Points(*points),
+        kernels.Sizes(views, channels, planes, height, width, *cells, tiles, blocks, slabs),
+        how,
+        min(float(options.near), torch.finfo(torch.float32).max),
+        tiles * blocks * slabs * source.shape[0] * (1 if options.reduce else views),
+        source.shape[0] * views,
+    )
+
+
+def _launch(kernel: Any, call: _Call, *arrays: Any) -> None:
+    """Run a kernel on the arrays' device, unless it has nothing to do."""
+    if call.programs:
+        with torch.cuda.device_of(arrays[0].pointer):
+            # Fused multiply-adds are Triton's default, and to become an option.
+            kernel[(call.programs,)](
+                *arrays, call.lattice, call.points, call.sizes, call.near, call.how, num_warps=4, enable_fp_fusion=True
+            )
+
+
+def _strided(array: Tensor) -> Any:
+    """A (B, V, C, z, y, x) array for a kernel."""
+    return _kernels()[0].Strided(array, *array.stride())
+
+
+def _power_of_two(count: int) -> int:
+    """The power of two at or above."""
+    return 1 << max(0, count - 1).bit_length()
+
+
+def _within(value: int, bounds: tuple[int, int]) -> int:
+    return min(max(value, bounds[0]), bounds[1])
+
+
+class _Tables(NamedTuple):
+    """The sites of a lattice for the kernels, float32, and what their gradients go back through, float64."""
+
+    views: Tensor  # (B V, FIELDS)
+    x: Tensor
+    y: Tensor
+    z: Tensor  # (B, V, D)
+    depth: Tensor | None  # (B, V, D), of frustums in volumes
+    projective: bool
+    matrix: Tensor  # as in `views`
+    scale: Tensor  # (B, V), of the matrix
+    direction: Tensor | None
+    shrink: Tensor | None  # (B, V), of the direction's matrix
+    exact: Tensor  # z, or the depth of volumes, float64
+
+
+def _tables(sites: Sites, options: Options, volume: bool) -> _Tables:
+    """Views left out have matrices of zeros: whatever stands in theirs reaches nobody."""
+    kernels, _ = _kernels()
+    mask = sites.view_mask
+    z = reference._per_view(sites.z, sites.matrix)
+    matrix, direction = sites.matrix, sites.direction if options.direction else None
+    if mask is not None:
+        z = torch.where(mask[..., None], z, 1.0)
+        matrix = torch.where(mask[..., None, None], matrix, 0.0)
+        direction = None if direction is None else torch.where(mask[..., None, None], direction, 0.0)
+    one = matrix.new_ones(matrix.shape[:2])
+    kept = one if mask is None else mask.to(one.dtype)
+    scale, shrink = one, None
+    if not volume:  # homogeneous: a factor moves no pixel
+        scale = reference._scale_below_overflow(reference._lattice_extent(matrix, sites._replace(z=z)))
+        matrix = matrix * scale[..., None, None]
+    fields = [matrix.flatten(2), scale[..., None], kept[..., None]]
+    if direction is None:
+        fields.append(one[..., None].expand(-1, -1, kernels.FIELDS.value - kernels.DIRECTION_FIELDS.value))
+    else:
+        shrink = 1.0 / reference._power_of_two(direction.abs().amax((-1, -2)))
+        direction = direction * shrink[..., None, None]
+        terms = direction.abs().amax(-2)
+        constant = terms[..., 0] * sites.x.abs().amax(0) + terms[..., 1] * sites.y.abs().amax(0) + terms[..., 3]
+        fields += [direction.flatten(2), constant[..., None], terms[..., 2, None]]
+    depth = 1.0 / z if volume else None
+    return _Tables(
+        torch.cat(fields, -1).float().contiguous(),
+        sites.x.float().contiguous(),
+        sites.y.float().contiguous(),
+        z.float().contiguous(),
+        None if depth is None else depth.float().contiguous(),
+        sites.projective,
+        matrix,
+        scale,
+        direction,
+        shrink,
+        z if depth is None else depth,
+    )
+
+
+def _channels_last(source: Tensor, reads: int) -> Tensor:
+    """The (B, V, C, d, h, w) source with its channels side by side, which is how the kernels read them.
+
+    A copy, of what is not repeated by strides of 0, unless few of its cells are read.
+    """
+    cells = math.prod(source.shape[3:])
+    if source.shape[2] == 1 or source.stride(2) == 1 or reads < cells or source.numel() == 0:
+        return source
+    once = source[tuple(slice(0, 1) if stride == 0 else slice(None) for stride in source.stride())]
+    return once.movedim(2, -1).contiguous().movedim(-1, 2).expand_as(source)
+
+
+def _empty_last(B: int, V: int, C: int, *sites: int, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+    """An uninitialised (B, V, C, D, H, W) array, channels last in memory."""
+    return torch.empty((B, V, *sites, C), dtype=dtype or like.dtype, device=like.device).movedim(-1, 2)
+
+
+# Gradients to the source
+
+
+class _Into(NamedTuple):
+    """Where the kernel adds the source's gradient."""
+
+    array: Tensor  # (B, V or 1, C, d, h, w)
+    scale: Tensor | None = None  # (1,) float32, of fixed-point numbers
+
+    def total(self) -> Tensor:
+        return self.array if self.scale is None else (self.array.double() / self.scale.double()).float()
+
+
+def _into(
+    gradient: Tensor, source: Tensor, options: Options, sites: int, shared: bool, given: Tensor | None = None
+) -> _Into:
+    """What to add to: float32, or, where results must not depend on the order of the sums, fixed-point numbers.
+
+    Args:
+        gradient: the incoming gradient.
+        source: (B, V, C, d, h, w).
+        options: of the call.
+        sites: how many sites may add to one cell.
+        shared: whether the views add to the same cells.
+        given: float32 numbers to add to, (B, 1, C, d, h, w); otherwise to zeros.
+    """
+    fixed = torch.are_deterministic_algorithms_enabled() and gradient.numel() > 0
+    if given is not None and not fixed:
+        return _Into(given)
+    B, V, C, *cells = source.shape
+    array = _empty_last(B, 1 if shared else V, C, *cells, like=source, dtype=torch.int64 if fixed else torch.float32)
+    array.zero_()
+    if not fixed:
+        return _Into(array)
+    bound = torch.linalg.vector_norm(gradient, math.inf, dtype=torch.float32).double() * max(1, len(options.reduce))
+    if "variance" in options.reduce and source.numel():
+        largest = source.float().nan_to_num(0.0, 0.0, 0.0).abs().amax().double()
+        bound = bound * (1.0 + 8.0 * largest)
+    exponent = 62.0 - math.ceil(math.log2(max(1, sites))) - torch.log2(bound).ceil()
+    # Not a number where the gradient has none: then nor has the result.
+    return _Into(array, torch.exp2(exponent.clamp(-126.0, 126.0)).float().reshape(1))
+
+
+# Gradients to the geometry
+
+
+def _lattice_gradients(
+    tables: _Tables, options: Options, index_sums: Tensor | None, extra_sums: Tensor | None
+) -> tuple[Tensor, Tensor | None, Tensor]:
+    """From sums over the sites to the gradients of M, G and z: (B, V, 3, 4) twice and (B, V, D).
+
+    Args:
+        tables: of the call.
+        options: of the call.
+        index_sums: (B V, D, blocks, tiles, 9), of the rows of M: of each g x, g y and g.
+        extra_sums: (B V, D, blocks, 13): of depth (g x, g y, g, and through s), and of the rows of G.
+    """
+    shape = (*tables.z.shape, 3, 3)
+    rows, through = tables.matrix.new_zeros(shape), tables.matrix.new_zeros(shape[:3])
+    if index_sums is not None:
+        rows = rows + index_sums.sum((2, 3), dtype=torch.float64).reshape(shape)
+    extra = None if extra_sums is None else extra_sums.sum(2, dtype=torch.float64).reshape(*shape[:3], -1)
+    if tables.depth is not None:
+        depth = tables.exact
+        matrix = _outer_sums(rows, depth, torch.ones_like(depth))
+        along = (rows * tables.matrix[:, :, None, :, (0, 1, 3)]).sum((-1, -2))
+        if options.depth and extra is not None:
+            along = along + extra[..., 3]
+        z_gradient = -along * depth.square()
+        z = 1.0 / depth
+    else:
+        z = tables.exact
+        if options.depth and extra is not None:
+            rows[..., 2, :] += extra[..., :3]
+            if tables.projective:
+                through = -extra[..., 3] / z
+        matrix = _outer_sums(rows, torch.ones_like(z), z) * tables.scale[..., None, None]
+        z_gradient = (rows[..., 2] * tables.matrix[:, :, None, :, 2]).sum(-1) + through
+    direction = None
+    if tables.direction is not None and tables.shrink is not None and extra is not None:
+        turned = extra[..., 4:].unflatten(-1, (3, 3))
+        direction = _outer_sums(turned, torch.ones_like(z), z) * tables.shrink[..., None, None]
+        z_gradient = z_gradient + (turned[..., 2] * tables.direction[:, :, None, :, 2]).sum(-1)
+    return matrix, direction, z_gradient
+
+
+def _outer_sums(rows: Tensor, plane: Tensor, line: Tensor) -> Tensor:
+    """Sums over the planes of (B, V, D, 3, 3) with factors (B, V, D) of the terms in x, y and 1, and in z."""
+    x, y, one = (rows * plane[..., None, None]).sum(2).unbind(-1)
+    return torch.stack((x, y, (rows[..., 2] * line[..., None]).sum(2), one), -1)
+
+
+def _sums(call: _Call, options: Options, needed: bool, like: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    """Room for the sums of `_lattice_gradients`, of those that the kernel writes."""
+    kernels, _ = _kernels()
+    n, index, extra = call.sizes, None, None
+    if needed and options.mode != "nearest":
+        index = like.new_empty((call.views, n.planes, n.blocks, n.tiles, kernels.INDEX_SUMS.value), dtype=torch.float32)
+    if needed and call.how.extras:
+        extra = like.new_empty((call.views, n.planes, n.blocks, kernels.EXTRA_SUMS.value), dtype=torch.float32)
+    return index, extra
+
+
+# Operators
+
+
+def _extras(options: Options) -> int:
+    return int(options.depth) + 3 * bool(options.direction)
+
+
+def _joined(values: Tensor, options: Options) -> Tensor:
+    """(B, 1, C'', ...) -> (B, C'', ...) where views are reduced."""
+    return values[:, 0] if options.reduce else values
+
+
+def _split(gradient: Tensor, options: Options) -> Tensor:
+    return gradient[:, None] if options.reduce else gradient
+
+
+def _forward(
+    source: Tensor, out: Tensor, options: Options, extras: int, sites: Sites | None = None, **planned: Any
+) -> Tensor:
+    """Fill `out` (B, V or 1, C', D, H, W) from `source` (B, V, C, d, h, w); returns visibility (B, V, D, H, W)."""
+    visible = torch.empty((*source.shape[:2], *out.shape[3:]), dtype=torch.uint8, device=source.device)
+    if not visible.numel():
+        return visible.view(torch.bool)
+    lattice = None if sites is None else _tables(sites, options, planned.get("volume", False))
+    call = _call(source, out, options, extras, lattice, **planned)
+    source = _channels_last(source, math.prod(out.shape[3:]) * call.how.corners)
+    _launch(_kernels()[0].resample, call, _strided(out), visible, _strided(source))
+    return visible.view(torch.bool)
+
+
+@torch.no_grad()
+def images(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
+    """`reference.unproject`: images (B, V, C, h, w) at the sites of a lattice.
+
+    Returns:
+        (B, V, C', D, H, W), or (B, C'', D, H, W) where options.reduce is set, channels last in memory, and visibility
+        (B, V, D, H, W).
+    """
+    B, V, C = source.shape[:3]
+    channels = (C + _extras(options)) * max(1, len(options.reduce))
+    shape = (sites.z.shape[-1], len(sites.y), len(sites.x))
+    out = _empty_last(B, 1 if options.reduce else V, channels, *shape, like=source)
+    visible = _forward(source.unsqueeze(3), out, options, _extras(options), sites)
+    return _joined(out, options), visible
+
+
+@torch.no_grad()
+def images_backward(
+    gradient: Tensor, source: Tensor, sites: Sites, options: Options, needs: tuple[bool, bool, bool, bool]
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+    """The vector-Jacobian product of `images`.
+
+    Args:
+        gradient: of its values, any strides.
+        source: as given to it.
+        sites: as given to it.
+        options: as given to it.
+        needs: which of the gradients below are needed.
+
+    Returns:
+        Gradients to the source, in its dtype; to M and G (B, V, 3, 4) and to z (B, V, D), float64. None where not
+        needed.
+    """
+    found = _lattice_backward(_split(gradient, options), source.unsqueeze(3), sites, options, needs, False)
+    return None if found[0] is None else saturating_cast(found[0].squeeze(3), source.dtype), *found[1:]
+
+
+def _lattice_backward(
+    gradient: Tensor,
+    source: Tensor,
+    sites: Sites,
+    options: Options,
+    needs: tuple[bool, bool, bool, bool],
+    volume: bool,
+    given: Tensor | None = None,
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+    """Gradients to a (B, V or 1, C, d, h, w) source, in float32, and to the geometry."""
+    wanted = needs[0], any(needs[1:])
+    count = math.prod(gradient.shape[3:]) * (source.shape[1] if volume else 1)
+    into = _into(gradient, source, options, count, volume, given) if needs[0] else None
+    if count:
+        tables = _tables(sites, options, volume)
+        call = _call(source, gradient, options, _extras(options), tables, volume=volume, needs=wanted)
+        index_sums, extra_sums = _sums(call, options, wanted[1], source)
+        _launch_backward(call, gradient, source, into, index_sums, extra_sums)
+        found = _lattice_gradients(tables, options, index_sums, extra_sums) if wanted[1] else (None,) * 3
+    else:
+        shape = sites.matrix.shape
+        found = torch.zeros_like(sites.matrix), None, sites.matrix.new_zeros((*shape[:2], sites.z.shape[-1]))
+    matrix, direction, z = found
+    if direction is None and sites.direction is not None:
+        direction = torch.zeros_like(sites.direction)
+    return (
+        None if into is None else into.total(),
+        matrix if needs[1] else None,
+        direction if needs[2] else None,
+        z if needs[3] else None,
+    )
+
+
+def _launch_backward(
+    call: _Call,
+    gradient: Tensor,
+    source: Tensor,
+    into: _Into | None,
+    index_sums: Tensor | None,
+    extra_sums: Tensor | None,
+) -> None:
+    if into is None and index_sums is None and extra_sums is None:
+        return  # the nearest cell does not depend on the geometry
+    if index_sums is not None or call.how.reduce:
+        source = _channels_last(source, math.prod(gradient.shape[3:]) * call.how.corners)
+    array, scale = (source, None) if into is None else (into.array.expand(source.shape), into.scale)
+    arrays = _strided(gradient), _strided(source), _strided(array), scale, index_sums, extra_sums
+    _launch(_kernels()[1].resample_backward, call, *arrays)
+
+
+@torch.no_grad()
+def pixels(
+    source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options
+) -> tuple[Tensor, Tensor]:
+    """Sample images (B, V, C, h, w) at given pixels; the options' depth and direction have been seen to.
+
+    Args:
+        source: the images.
+        pixels: (B, V, N, 2).
+        front: (B, V, N) bool, where to sample.
+        extra: (B, V, E, N), geometric channels to append, or None.
+        options: of the call.
+
+    Returns:
+        (B, V, C + E, N), or (B, C'', N) where options.reduce is set, channels last in memory, and visibility (B, V, N).
+    """
+    (B, V, C), N = source.shape[:3], pixels.shape[2]
+    extras = 0 if extra is None else extra.shape[2]
+    channels = (C + extras) * max(1, len(options.reduce))
+    out = _empty_last(B, 1 if options.reduce else V, channels, 1, 1, N, like=source)
+    visible = _forward(source.unsqueeze(3), out, options, extras, points=_points(pixels, front, extra))
+    return _joined(out[:, :, :, 0, 0], options), visible[:, :, 0, 0]
+
+
+def _points(pixels: Tensor, front: Tensor, extra: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    return (
+        pixels.float().contiguous(),
+        front.contiguous().view(torch.uint8),
+        None if extra is None else extra.float().contiguous(),
+    )
+
+
+@torch.no_grad()
+def pixels_backward(
+    gradient: Tensor,
+    source: Tensor,
+    pixels: Tensor,
+    front: Tensor,
+    extra: Tensor | None,
+    options: Options,
+    needs: tuple[bool, bool, bool],
+) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    """The vector-Jacobian product of `pixels`: gradients to source, pixels and extra, in their dtypes.
+
+    Args:
+        gradient: of its values, any strides.
+        source: as given to it.
+        pixels: as given to it.
+        front: as given to it.
+        extra: as given to it.
+        options: as given to it.
+        needs: which gradients are needed; the others are None.
+    """
+    (B, V), N = source.shape[:2], pixels.shape[2]
+    extras = 0 if extra is None else extra.shape[2]
+    target, maps = _split(gradient, options)[:, :, :, None, None], source.unsqueeze(3)
+    points = _points(pixels, front, extra)
+    call = _call(maps, target, options, extras, points=points, needs=(needs[0], any(needs[1:])))
+    into = _into(target, maps, options, N, False) if needs[0] else None
+    index_sums = extra_sums = None
+    if any(needs[1:]) and options.mode != "nearest":
+        index_sums = source.new_empty((B, V, N, call.sizes.tiles, 2), dtype=torch.float32)
+    if any(needs[1:]) and extras:
+        extra_sums = source.new_empty((B, V, extras, N), dtype=torch.float32)
+    _launch_backward(call, target, maps, into, index_sums, extra_sums)
+    grad_pixels = grad_extra = None
+    if needs[1]:
+        grad_pixels = torch.zeros_like(pixels) if index_sums is None else index_sums.sum(3).to(pixels.dtype)
+    if needs[2] and extra is not None:
+        grad_extra = torch.zeros_like(extra) if extra_sums is None else extra_sums.to(extra.dtype)
+    return None if into is None else saturating_cast(into.total().squeeze(3), source.dtype), grad_pixels, grad_extra
+
+
+@torch.no_grad()
+def volume(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """`reference.plane_sweep_project`: volumes (B, C, D, H, W) at the sites of the views' frustums.
+
+    Args:
+        source: the volumes.
+        sites: the frustums, P planes.
+        options: of the call; where `stacked`, memory is [B][V][h][w][C'][P], else [B][V][P][h][w][C'].
+        out: where to write the maps, any strides, or None.
+
+    Returns:
+        Maps (B, V, C', P, h, w) and visibility (B, V, P, h, w).
+    """
+    (B, C), V = source.shape[:2], sites.matrix.shape[1]
+    channels, (P, h, w) = C + _extras(options), (sites.z.shape[-1], len(sites.y), len(sites.x))
+    if out is None and getattr(options, "stacked", False):
+        out = source.new_empty((B, V, h, w, channels, P)).permute(0, 1, 4, 5, 2, 3)
+    elif out is None:
+        out = _empty_last(B, V, channels, P, h, w, like=source)
+    views = _seen_by(source, V)
+    return out, _forward(views, out, options, _extras(options), sites, volume=True)
+
+
+def _seen_by(source: Tensor, V: int) -> Tensor:
+    """(B, C, D, H, W) -> (B, V, C, D, H, W)."""
+    return source[:, None].expand(source.shape[0], V, *source.shape[1:])
+
+
+@torch.no_grad()
+def volume_backward(
+    gradient: Tensor,
+    source: Tensor,
+    sites: Sites,
+    options: Options,
+    needs: tuple[bool, bool, bool, bool],
+    into: Tensor | None = None,
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+    """The vector-Jacobian product of `volume`, as `images_backward`.
+
+    Args:
+        gradient: of its maps, any strides.
+        source: as given to it.
+        sites: as given to it.
+        options: as given to it.
+        needs: which gradients are needed.
+        into: float32, of the source's shape: the source's gradient is added to it, and it is returned.
+    """
+    views = _seen_by(source, sites.matrix.shape[1])
+    given = None if into is None else into[:, None]
+    total, *geometry = _lattice_backward(gradient, views, sites, options, needs, True, given)
+    if total is None:
+        found = None
+    elif into is None:
+        found = saturating_cast(total[:, 0], source.dtype)
+    else:
+        found = into if total is given else into.add_(total[:, 0])
+    return found, *geometry

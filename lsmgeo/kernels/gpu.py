@@ -1,7 +1,7 @@
-"""The Triton backend: tables for the kernels, their launch, and the small matrices' share of the gradients.
+"""The Triton backend: the operators, and how the kernels are launched for them.
 
-Tensors in, tensors out, no autograd. Triton is imported at the first call. Everything of the size of the sites is done
-in one launch; what PyTorch does here is of the size of the matrices and the axes, in float64.
+Tensors in, tensors out, no autograd. Everything of the size of the sites is done in one launch. Triton is imported at
+the first call.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from lsmgeo._dtypes import saturating_cast
-from lsmgeo.kernels import reference
+from lsmgeo.kernels.gpu_tables import Tables, lattice_gradients, tables
 from lsmgeo.kernels.request import Options, Sites
 
 __all__ = [
@@ -30,7 +30,7 @@ __all__ = [
     "why_not",
 ]
 
-TILE = 2048  # elements, 16 for each thread of four warps
+TILE = 2048  # elements: 16 for each thread of four warps
 SITES = (16, 256)  # of a tile
 CHANNELS = (4, 64)
 PLANES = 32  # 128 bytes of float32
@@ -77,7 +77,7 @@ def _call(
     target: Tensor,
     options: Options,
     extras: int,
-    lattice: _Tables | None = None,
+    lattice: Tables | None = None,
     points: Sequence[Tensor | None] = (None, None, None),
     volume: bool = False,
     needs: tuple[bool, bool] = (False, False),
@@ -97,11 +97,14 @@ def _call(
     kernels, _ = _kernels()
     views, channels = source.shape[1:3]
     planes, height, width = target.shape[3:]
-    # Along the axis that is the fastest in memory, a store is one transaction.
-    fast = planes > 1 and 0 < target.stride(3) < max(target.stride(5), target.stride(4))
-    run = min(PLANES, _power_of_two(planes)) if fast else 1
     columns = _within(_power_of_two(channels), CHANNELS)
-    block = max(run, _within(TILE // columns, SITES))
+    block = _within(TILE // columns, SITES)
+    # Small planes share a program. Where the third axis is the fastest in memory, a store along it is one transaction.
+    run = max(1, block // _power_of_two(height * width))
+    if 0 < target.stride(3) < max(target.stride(4), target.stride(5)):
+        run = max(run, PLANES)
+    run = min(run, _power_of_two(planes))
+    block = max(run, block)
     tiles, slabs = max(1, -(-channels // columns)), -(-planes // run)
     blocks = -(-height * width // (block // run))
     blocks_of = {name: place for place, name in enumerate(options.reduce)}
@@ -142,9 +145,17 @@ def _launch(kernel: Any, call: _Call, *arrays: Any) -> None:
     """Run a kernel on the arrays' device, unless it has nothing to do."""
     if call.programs:
         with torch.cuda.device_of(arrays[0].pointer):
-            # Fused multiply-adds are Triton's default, and to become an option.
+            warps = 8 if call.how.reduce else 4  # statistics need more registers
+            # Fused multiply-adds are Triton's default, which is to change.
             kernel[(call.programs,)](
-                *arrays, call.lattice, call.points, call.sizes, call.near, call.how, num_warps=4, enable_fp_fusion=True
+                *arrays,
+                call.lattice,
+                call.points,
+                call.sizes,
+                call.near,
+                call.how,
+                num_warps=warps,
+                enable_fp_fusion=True,
             )
 
 
@@ -160,63 +171,6 @@ def _power_of_two(count: int) -> int:
 
 def _within(value: int, bounds: tuple[int, int]) -> int:
     return min(max(value, bounds[0]), bounds[1])
-
-
-class _Tables(NamedTuple):
-    """The sites of a lattice for the kernels, float32, and what their gradients go back through, float64."""
-
-    views: Tensor  # (B V, FIELDS)
-    x: Tensor
-    y: Tensor
-    z: Tensor  # (B, V, D)
-    depth: Tensor | None  # (B, V, D), of frustums in volumes
-    projective: bool
-    matrix: Tensor  # as in `views`
-    scale: Tensor  # (B, V), of the matrix
-    direction: Tensor | None
-    shrink: Tensor | None  # (B, V), of the direction's matrix
-    exact: Tensor  # z, or the depth of volumes, float64
-
-
-def _tables(sites: Sites, options: Options, volume: bool) -> _Tables:
-    """Views left out have matrices of zeros: whatever stands in theirs reaches nobody."""
-    kernels, _ = _kernels()
-    mask = sites.view_mask
-    z = reference._per_view(sites.z, sites.matrix)
-    matrix, direction = sites.matrix, sites.direction if options.direction else None
-    if mask is not None:
-        z = torch.where(mask[..., None], z, 1.0)
-        matrix = torch.where(mask[..., None, None], matrix, 0.0)
-        direction = None if direction is None else torch.where(mask[..., None, None], direction, 0.0)
-    one = matrix.new_ones(matrix.shape[:2])
-    kept = one if mask is None else mask.to(one.dtype)
-    scale, shrink = one, None
-    if not volume:  # homogeneous: a factor moves no pixel
-        scale = reference._scale_below_overflow(reference._lattice_extent(matrix, sites._replace(z=z)))
-        matrix = matrix * scale[..., None, None]
-    fields = [matrix.flatten(2), scale[..., None], kept[..., None]]
-    if direction is None:
-        fields.append(one[..., None].expand(-1, -1, kernels.FIELDS.value - kernels.DIRECTION_FIELDS.value))
-    else:
-        shrink = 1.0 / reference._power_of_two(direction.abs().amax((-1, -2)))
-        direction = direction * shrink[..., None, None]
-        terms = direction.abs().amax(-2)
-        constant = terms[..., 0] * sites.x.abs().amax(0) + terms[..., 1] * sites.y.abs().amax(0) + terms[..., 3]
-        fields += [direction.flatten(2), constant[..., None], terms[..., 2, None]]
-    depth = 1.0 / z if volume else None
-    return _Tables(
-        torch.cat(fields, -1).float().contiguous(),
-        sites.x.float().contiguous(),
-        sites.y.float().contiguous(),
-        z.float().contiguous(),
-        None if depth is None else depth.float().contiguous(),
-        sites.projective,
-        matrix,
-        scale,
-        direction,
-        shrink,
-        z if depth is None else depth,
-    )
 
 
 def _channels_last(source: Tensor, reads: int) -> Tensor:
@@ -279,57 +233,8 @@ def _into(
     return _Into(array, torch.exp2(exponent.clamp(-126.0, 126.0)).float().reshape(1))
 
 
-# Gradients to the geometry
-
-
-def _lattice_gradients(
-    tables: _Tables, options: Options, index_sums: Tensor | None, extra_sums: Tensor | None
-) -> tuple[Tensor, Tensor | None, Tensor]:
-    """From sums over the sites to the gradients of M, G and z: (B, V, 3, 4) twice and (B, V, D).
-
-    Args:
-        tables: of the call.
-        options: of the call.
-        index_sums: (B V, D, blocks, tiles, 9), of the rows of M: of each g x, g y and g.
-        extra_sums: (B V, D, blocks, 13): of depth (g x, g y, g, and through s), and of the rows of G.
-    """
-    shape = (*tables.z.shape, 3, 3)
-    rows, through = tables.matrix.new_zeros(shape), tables.matrix.new_zeros(shape[:3])
-    if index_sums is not None:
-        rows = rows + index_sums.sum((2, 3), dtype=torch.float64).reshape(shape)
-    extra = None if extra_sums is None else extra_sums.sum(2, dtype=torch.float64).reshape(*shape[:3], -1)
-    if tables.depth is not None:
-        depth = tables.exact
-        matrix = _outer_sums(rows, depth, torch.ones_like(depth))
-        along = (rows * tables.matrix[:, :, None, :, (0, 1, 3)]).sum((-1, -2))
-        if options.depth and extra is not None:
-            along = along + extra[..., 3]
-        z_gradient = -along * depth.square()
-        z = 1.0 / depth
-    else:
-        z = tables.exact
-        if options.depth and extra is not None:
-            rows[..., 2, :] += extra[..., :3]
-            if tables.projective:
-                through = -extra[..., 3] / z
-        matrix = _outer_sums(rows, torch.ones_like(z), z) * tables.scale[..., None, None]
-        z_gradient = (rows[..., 2] * tables.matrix[:, :, None, :, 2]).sum(-1) + through
-    direction = None
-    if tables.direction is not None and tables.shrink is not None and extra is not None:
-        turned = extra[..., 4:].unflatten(-1, (3, 3))
-        direction = _outer_sums(turned, torch.ones_like(z), z) * tables.shrink[..., None, None]
-        z_gradient = z_gradient + (turned[..., 2] * tables.direction[:, :, None, :, 2]).sum(-1)
-    return matrix, direction, z_gradient
-
-
-def _outer_sums(rows: Tensor, plane: Tensor, line: Tensor) -> Tensor:
-    """Sums over the planes of (B, V, D, 3, 3) with factors (B, V, D) of the terms in x, y and 1, and in z."""
-    x, y, one = (rows * plane[..., None, None]).sum(2).unbind(-1)
-    return torch.stack((x, y, (rows[..., 2] * line[..., None]).sum(2), one), -1)
-
-
 def _sums(call: _Call, options: Options, needed: bool, like: Tensor) -> tuple[Tensor | None, Tensor | None]:
-    """Room for the sums of `_lattice_gradients`, of those that the kernel writes."""
+    """Room for the sums of `lattice_gradients`, of those that the kernel writes."""
     kernels, _ = _kernels()
     n, index, extra = call.sizes, None, None
     if needed and options.mode != "nearest":
@@ -362,7 +267,7 @@ def _forward(
     visible = torch.empty((*source.shape[:2], *out.shape[3:]), dtype=torch.uint8, device=source.device)
     if not visible.numel():
         return visible.view(torch.bool)
-    lattice = None if sites is None else _tables(sites, options, planned.get("volume", False))
+    lattice = None if sites is None else tables(sites, options, planned.get("volume", False))
     call = _call(source, out, options, extras, lattice, **planned)
     source = _channels_last(source, math.prod(out.shape[3:]) * call.how.corners)
     _launch(_kernels()[0].resample, call, _strided(out), visible, _strided(source))
@@ -420,11 +325,11 @@ def _lattice_backward(
     count = math.prod(gradient.shape[3:]) * (source.shape[1] if volume else 1)
     into = _into(gradient, source, options, count, volume, given) if needs[0] else None
     if count:
-        tables = _tables(sites, options, volume)
-        call = _call(source, gradient, options, _extras(options), tables, volume=volume, needs=wanted)
+        known = tables(sites, options, volume)
+        call = _call(source, gradient, options, _extras(options), known, volume=volume, needs=wanted)
         index_sums, extra_sums = _sums(call, options, wanted[1], source)
         _launch_backward(call, gradient, source, into, index_sums, extra_sums)
-        found = _lattice_gradients(tables, options, index_sums, extra_sums) if wanted[1] else (None,) * 3
+        found = lattice_gradients(known, options, index_sums, extra_sums) if wanted[1] else (None,) * 3
     else:
         shape = sites.matrix.shape
         found = torch.zeros_like(sites.matrix), None, sites.matrix.new_zeros((*shape[:2], sites.z.shape[-1]))
@@ -578,11 +483,11 @@ def volume_backward(
     """
     views = _seen_by(source, sites.matrix.shape[1])
     given = None if into is None else into[:, None]
-    total, *geometry = _lattice_backward(gradient, views, sites, options, needs, True, given)
+    total, matrix, direction, z = _lattice_backward(gradient, views, sites, options, needs, True, given)
     if total is None:
         found = None
     elif into is None:
         found = saturating_cast(total[:, 0], source.dtype)
     else:
         found = into if total is given else into.add_(total[:, 0])
-    return found, *geometry
+    return found, matrix, direction, z

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import triton  # type: ignore[import-untyped]
 import triton.language as tl  # type: ignore[import-untyped]
 
-__all__ = ["DIRECTION_FIELDS", "EXTRA_SUMS", "FIELDS", "INDEX_SUMS", "How", "Lattice", "Points", "Sizes", "Strided"]
+__all__ = ["EXTRA_SUMS", "INDEX_SUMS", "How", "Lattice", "Points", "Sizes", "Strided"]
 
 # What a lane is: a site of a lattice that looks into images, or into volumes, or a given pixel of images.
 IMAGES = tl.constexpr(0)

@@ -1,5 +1,6 @@
 # `make demo` and `make test` are all that a fresh machine needs: each makes the environment first, when it is
-# missing or older than setup.cfg. Needed beforehand: Python 3.11 or newer, git, make, a C compiler.
+# missing or older than setup.cfg. Needed beforehand: Python 3.11 or newer, git, make; with a C++ compiler the kernels
+# for the CPU are built too.
 
 SHELL := /bin/bash
 VENV  ?= .venv
@@ -34,12 +35,15 @@ $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo 'Python 3.11 or newer is needed; name one with make PYTHON=/path/to/python' >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.core: setup.cfg pyproject.toml | $(BIN)/python
+# What the installation is made from.
+SOURCES := setup.cfg setup.py pyproject.toml $(wildcard lsmgeo/kernels/native/*)
+
+$(VENV)/.core: $(SOURCES) | $(BIN)/python
 	@echo 'installing lsmgeo into $(VENV) (once; PyTorch is large)'
 	$(call install,$(BIN),-e .)
 	@touch $@
 
-$(VENV)/.dev: setup.cfg pyproject.toml | $(BIN)/python
+$(VENV)/.dev: $(SOURCES) | $(BIN)/python
 	@echo 'installing lsmgeo and what its tests and docs need into $(VENV) (once; PyTorch is large)'
 	$(call install,$(BIN),-e '.[dev]')
 	@touch $(VENV)/.core $@

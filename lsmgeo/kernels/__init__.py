@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from torch import Tensor
 
 from lsmgeo._checks import check_choice, check_float
 from lsmgeo.errors import BackendError
-from lsmgeo.kernels import reference
+from lsmgeo.kernels import fused, reference
 from lsmgeo.kernels.request import OPERATORS, Options, Sites
 
 __all__ = ["BACKENDS", "OPERATORS", "Backend", "Options", "Sites", "check_backend", "explain", "run", "select"]
@@ -35,7 +36,11 @@ class Backend:
     operators: Mapping[str, Callable[..., Any]]
 
 
-BACKENDS: tuple[Backend, ...] = (Backend("reference", reference.why_not, reference.OPERATORS),)
+# In the order in which "auto" tries them.
+BACKENDS: tuple[Backend, ...] = (
+    *(Backend(name, partial(fused.why_not, name), fused.operators(name)) for name in fused.KERNELS),
+    Backend("reference", reference.why_not, reference.OPERATORS),
+)
 
 
 def check_backend(who: str, name: object) -> str:

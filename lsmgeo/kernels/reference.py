@@ -245,15 +245,22 @@ def _sample_through_cameras(
     Returns:
         Values (B, V, C, *sites), visibility, and depth or None.
     """
+    index, front = _divide(rows, unit, view_mask, options)
+    values, visible = _sample(source, index, front, options)
+    return values, visible, _masked(rows[2] / unit, view_mask) if options.depth else None
+
+
+def _divide(
+    rows: Sequence[Tensor], unit: Tensor, view_mask: Tensor | None, options: Options
+) -> tuple[list[Tensor], Tensor]:
+    """From homogeneous pixels to pixels x and y, `OUTSIDE` for sites not in front; and which are in front."""
     x, y, z = rows
     threshold = (options.near * unit).clamp_min(SMALLEST_DEPTH)
     if view_mask is not None:
         threshold = torch.where(_aligned(view_mask, z.dim()), threshold, torch.inf)
     front = z > threshold
     inverse = torch.where(front, z, 1.0).reciprocal()
-    index = [torch.where(front, axis * inverse, OUTSIDE) for axis in (x, y)]
-    values, visible = _sample(source, index, front, options)
-    return values, visible, _masked(z / unit, view_mask) if options.depth else None
+    return [torch.where(front, axis * inverse, OUTSIDE) for axis in (x, y)], front
 
 
 def _over_pieces(

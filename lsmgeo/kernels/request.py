@@ -56,6 +56,7 @@ class Options:
     direction: str = ""  # "", or the frame of the directions to append
     reduce: tuple[str, ...] = ()
     near: float = 1e-6
+    stacked: bool = False  # whether planes will be stacked with the channels: a fused kernel lays them out for it
 
     @classmethod
     def checked(

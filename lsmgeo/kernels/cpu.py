@@ -1,0 +1,408 @@
+"""The C++ kernels: loading the library, and calls on tensors without derivatives.
+
+The library is a part of the package that a build without a compiler leaves out; `why_not` says so then. It knows nothing
+of Python or PyTorch: tensors are handed over as addresses and strides, threads are those of PyTorch's own pool.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sysconfig
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lsmgeo.kernels.request import Options, Sites
+
+__all__ = [
+    "fresh",
+    "images",
+    "images_backward",
+    "instruction_set",
+    "pixels",
+    "pixels_backward",
+    "volume",
+    "volume_backward",
+    "why_not",
+]
+
+IMAGES, PIXELS, VOLUMES = range(3)
+TYPES = {torch.float32: 0, torch.bfloat16: 1, torch.float16: 2}
+STATISTICS = {"mean": 0, "variance": 1, "max": 2}
+HUGE = 4 << 20  # bytes from which an output is put in huge pages
+LEAST_CHUNK = 8  # channels that are worth a task of their own
+
+_INTEGER, _NUMBER, _ADDRESS = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+
+
+class _Call(ctypes.Structure):
+    """`Call` of native/call.h, field by field."""
+
+    _fields_ = (
+        *((name, _INTEGER) for name in ("kind", "threads", "scenes", "views", "channels")),
+        ("size", 3 * _INTEGER),
+        ("sites", 3 * _INTEGER),
+        *((name, _INTEGER) for name in ("nearest", "border", "projective", "depth", "direction", "extra")),
+        ("statistics", _INTEGER),
+        ("statistic", 3 * _INTEGER),
+        ("near", _NUMBER),
+        ("source", _ADDRESS),
+        ("source_type", _INTEGER),
+        ("source_stride", 5 * _INTEGER),
+        *((name, _ADDRESS) for name in ("matrix", "direction_matrix", "x", "y", "z")),
+        ("z_stride", 3 * _INTEGER),
+        *((name, _ADDRESS) for name in ("view_mask", "pixels", "front", "extras")),
+        ("values", _ADDRESS),
+        ("values_type", _INTEGER),
+        ("values_stride", 6 * _INTEGER),
+        ("visible", _ADDRESS),
+        ("gradient", _ADDRESS),
+        ("gradient_type", _INTEGER),
+        ("gradient_stride", 6 * _INTEGER),
+        ("chunks", _INTEGER),
+        ("accumulate", _INTEGER),
+        ("source_gradient", _ADDRESS),
+        ("source_gradient_stride", 5 * _INTEGER),
+        *((name, _ADDRESS) for name in ("matrix_gradient", "direction_gradient", "z_gradient")),
+        *((name, _ADDRESS) for name in ("pixels_gradient", "extras_gradient")),
+    )
+
+
+@cache
+def _library() -> ctypes.CDLL | str:
+    """The library, or why there is none."""
+    if os.environ.get("LSMGEO_NATIVE") == "0":
+        return "turned off by LSMGEO_NATIVE=0"
+    folder = Path(__file__).parent
+    names = (f"_native{suffix}" for suffix in (".abi3.so", sysconfig.get_config_var("EXT_SUFFIX"), ".so", ".pyd"))
+    path = next((folder / name for name in names if (folder / name).is_file()), None)
+    if path is None:
+        return "not built; install from source with a C++ compiler to have it"
+    return load(path)
+
+
+def load(path: Path) -> ctypes.CDLL | str:
+    """The library in a file, ready for calls, or why it cannot be used."""
+    try:
+        library = ctypes.CDLL(str(path))
+    except OSError as error:
+        return f"{path.name} does not load: {error}"
+    library.lsmgeo_size_of_call.restype = ctypes.c_int64
+    if library.lsmgeo_size_of_call() != ctypes.sizeof(_Call):
+        return f"{path.name} was built from other sources; install again"
+    library.lsmgeo_instruction_set.restype = ctypes.c_char_p
+    library.lsmgeo_use_huge_pages.argtypes = (ctypes.c_void_p, ctypes.c_int64)
+    library.lsmgeo_use_openmp.argtypes = (ctypes.c_void_p,)
+    try:
+        parallel = ctypes.CDLL(None).GOMP_parallel  # of the OpenMP runtime that PyTorch has loaded
+        library.lsmgeo_use_openmp(ctypes.cast(parallel, ctypes.c_void_p))
+    except (AttributeError, OSError, TypeError):
+        pass  # the library starts threads of its own
+    return library
+
+
+def why_not(operator: str, source: Tensor, options: Options) -> str | None:
+    """Why the C++ kernels cannot run a call, or None."""
+    if source.device.type != "cpu":
+        return f"runs on the CPU, the source is on {source.device.type}"
+    if source.dtype not in TYPES:
+        return f"computes in float32, the source is {str(source.dtype).removeprefix('torch.')}"
+    library = _library()
+    return library if isinstance(library, str) else None
+
+
+def instruction_set(name: str | None = None) -> str:
+    """The instruction set in use: "avx512", "avx2" or "baseline"; sets another by its name, if the machine has it."""
+    library = _library()
+    if isinstance(library, str):
+        raise RuntimeError(library)
+    found = library.lsmgeo_instruction_set(None if name is None else name.encode())
+    if found is None:
+        raise ValueError(f"this machine does not have the instruction set {name!r}")
+    return found.decode()
+
+
+def fresh(shape: Sequence[int], dtype: torch.dtype, order: Sequence[int] | None = None) -> Tensor:
+    """Memory for an output of this shape; `order` names its axes from the slowest to the fastest.
+
+    Large outputs are put in huge pages: touching fresh pages of 4 KiB costs as much as the kernels do.
+    """
+    order = tuple(range(len(shape))) if order is None else order
+    tensor = torch.empty([shape[axis] for axis in order], dtype=dtype)
+    if tensor.nbytes >= HUGE and not isinstance(library := _library(), str):
+        library.lsmgeo_use_huge_pages(tensor.data_ptr(), tensor.nbytes)
+    return tensor.permute([order.index(axis) for axis in range(len(shape))])
+
+
+# Calls: each function fills in what it has, hands it over, and keeps the tensors alive until the kernel is done.
+
+
+def _run(call: _Call, backward: bool) -> None:
+    library = _library()
+    assert not isinstance(library, str), library
+    failed = (library.lsmgeo_backward if backward else library.lsmgeo_forward)(ctypes.byref(call))
+    if failed:
+        raise MemoryError("lsmgeo: no memory for the workspace of a kernel")
+
+
+def _channels_last(source: Tensor, axis: int) -> Tensor:
+    """The source with channels next to one another; a copy only where they are not."""
+    if source.shape[axis] < 2 or source.stride(axis) == 1:
+        return source
+    return source.movedim(axis, -1).contiguous().movedim(-1, axis)
+
+
+def _start(kind: int, source: Tensor, options: Options, sites: Sequence[int]) -> _Call:
+    call = _Call()
+    call.kind, call.threads = kind, torch.get_num_threads()
+    strides = source.stride()
+    if kind == VOLUMES:
+        call.scenes, call.channels, *sizes = source.shape
+        call.source_stride[:] = (strides[0], 0, *strides[2:])
+    else:
+        call.scenes, call.views, call.channels, *sizes = source.shape
+        call.source_stride[:] = (*strides[:2], 0, *strides[3:])
+    call.size[:] = (*reversed(sizes), 1)[:3]
+    call.sites[:] = sites
+    call.nearest = options.mode == "nearest"
+    call.border = options.padding_mode == "border"
+    call.statistics = len(options.reduce)
+    for number, name in enumerate(options.reduce):
+        call.statistic[number] = STATISTICS[name]
+    call.near = options.near
+    call.source, call.source_type = source.data_ptr(), TYPES[source.dtype]
+    return call
+
+
+def _place(call: _Call, sites: Sites, options: Options) -> tuple[Tensor | None, ...]:
+    """Hand over the geometry; the answer must live as long as the call."""
+    B, V = call.scenes, call.views = sites.matrix.shape[:2]
+    matrix, x, y = sites.matrix.contiguous(), sites.x.contiguous(), sites.y.contiguous()
+    direction = sites.direction.expand(B, V, 3, 4).contiguous() if options.direction else None  # type: ignore[union-attr]
+    z = sites.z[:, None] if sites.z.dim() == 2 else sites.z
+    z = z.expand(B, V, z.shape[-1])
+    mask = None if sites.view_mask is None else sites.view_mask.contiguous()
+    call.projective, call.depth, call.direction = sites.projective, options.depth, bool(options.direction)
+    call.matrix, call.x, call.y, call.z = matrix.data_ptr(), x.data_ptr(), y.data_ptr(), z.data_ptr()
+    call.z_stride[:] = z.stride()
+    call.direction_matrix = None if direction is None else direction.data_ptr()
+    call.view_mask = None if mask is None else mask.data_ptr()
+    return matrix, direction, x, y, z, mask
+
+
+def _values(call: _Call, values: Tensor, strides: Sequence[int], visible: Tensor) -> None:
+    call.values, call.values_type, call.visible = values.data_ptr(), TYPES[values.dtype], visible.data_ptr()
+    call.values_stride[:] = strides
+
+
+def _gradient(call: _Call, gradient: Tensor, strides: Sequence[int]) -> None:
+    """Hand over the incoming gradient, and split the channels where scenes and views alone would not feed the threads."""
+    call.gradient, call.gradient_type = gradient.data_ptr(), TYPES[gradient.dtype]
+    call.gradient_stride[:] = strides
+    units = max(1, call.scenes * (1 if call.kind == VOLUMES or call.statistics else call.views))
+    chunks = min(call.channels // (2 * LEAST_CHUNK), -(-2 * call.threads // units))
+    if chunks * units < call.threads:
+        chunks = min(call.channels // LEAST_CHUNK, -(-call.threads // units))
+    call.chunks = max(1, chunks)
+
+
+def _source_gradient(call: _Call, source: Tensor, axis: int, into: Tensor | None) -> Tensor:
+    """Where the source's gradient goes, in float32: `into`, to be added to, or fresh memory that the kernel clears."""
+    if into is None:
+        order = [other for other in range(source.dim()) if other != axis]
+        gradient = fresh(source.shape, torch.float32, [*order, axis])
+    elif into.shape[axis] > 1 and into.stride(axis) != 1:
+        raise ValueError("the channels of a gradient to add to must be next to one another")
+    else:
+        gradient = into
+    strides = gradient.stride()
+    call.accumulate, call.source_gradient = into is not None, gradient.data_ptr()
+    call.source_gradient_stride[:] = (strides[0], 0, *strides[2:]) if axis == 1 else (*strides[:2], 0, *strides[3:])
+    return gradient
+
+
+def _geometry_gradients(call: _Call, needs: Sequence[bool]) -> list[Tensor | None]:
+    """Room for the gradients to matrix, direction and z, a part for each chunk of channels."""
+    B, V, D = call.scenes, call.views, call.sites[2]
+    shapes = ((3, 4), (3, 4), (D,))
+    parts = [
+        torch.zeros(B, V, call.chunks, *shape, dtype=torch.float64) if need else None
+        for shape, need in zip(shapes, needs, strict=True)
+    ]
+    call.matrix_gradient, call.direction_gradient, call.z_gradient = (
+        None if part is None else part.data_ptr() for part in parts
+    )
+    return parts
+
+
+def _together(parts: Sequence[Tensor | None]) -> list[Tensor | None]:
+    return [None if part is None else part.sum(2) for part in parts]
+
+
+def images(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """`reference.unproject`; `out` is memory of the answer's shape to write to."""
+    source = _channels_last(source, 2)
+    B, V, C = source.shape[:3]
+    counts = (sites.z.shape[-1], sites.y.shape[0], sites.x.shape[0])
+    call = _start(IMAGES, source, options, counts[::-1])
+    kept = _place(call, sites, options)
+    channels = C + call.depth + 3 * call.direction
+    if options.reduce:
+        values = (
+            fresh((B, channels * len(options.reduce), *counts), source.dtype, (0, 2, 3, 4, 1)) if out is None else out
+        )
+        strides = (values.stride(0), 0, *values.stride()[1:])
+    else:
+        values = fresh((B, V, channels, *counts), source.dtype, (0, 1, 3, 4, 5, 2)) if out is None else out
+        strides = values.stride()
+    visible = torch.empty((B, V, *counts), dtype=torch.bool)
+    _values(call, values, strides, visible)
+    _run(call, backward=False)
+    del kept
+    return values, visible
+
+
+def images_backward(
+    gradient: Tensor,
+    source: Tensor,
+    sites: Sites,
+    options: Options,
+    needs: Sequence[bool],
+    into: Tensor | None = None,
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+    """Vector-Jacobian product of `images` to source, matrix, direction and z.
+
+    Args:
+        gradient: of the values, any strides.
+        source: as for `images`.
+        sites: as for `images`.
+        options: as for `images`.
+        needs: which of the four are asked for.
+        into: float32 memory of the source's shape, channels next to one another, to add its gradient to.
+
+    Returns:
+        Gradients, None where not asked for: of source in its dtype, of matrices (B, V, 3, 4) and of z (B, V, D) in
+        float64.
+    """
+    original, source = source, _channels_last(source, 2)
+    counts = (sites.z.shape[-1], sites.y.shape[0], sites.x.shape[0])
+    call = _start(IMAGES, source, options, counts[::-1])
+    kept = _place(call, sites, options)
+    strides = gradient.stride()
+    _gradient(call, gradient, (strides[0], 0, *strides[1:]) if options.reduce else strides)
+    to_source = _source_gradient(call, source, 2, into) if needs[0] else None
+    parts = _geometry_gradients(call, (needs[1], needs[2] and bool(options.direction), needs[3]))
+    _run(call, backward=True)
+    del kept
+    if to_source is not None and into is None:
+        to_source = to_source.to(original.dtype)
+    return to_source, *_together(parts)  # type: ignore[return-value]
+
+
+def pixels(
+    source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options
+) -> tuple[Tensor, Tensor]:
+    """Sample images (B, V, C, h, w) at pixels (B, V, N, 2) where `front` (B, V, N), append `extra` (B, V, E, N)."""
+    source = _channels_last(source, 2)
+    B, V, C = source.shape[:3]
+    call, kept = _pixel_call(source, pixels, front, extra, options)
+    N, channels = front.shape[-1], C + call.extra
+    if options.reduce:
+        values = fresh((B, channels * len(options.reduce), N), source.dtype, (0, 2, 1))
+        strides = (values.stride(0), 0, values.stride(1), 0, 0, values.stride(2))
+    else:
+        values = fresh((B, V, channels, N), source.dtype, (0, 1, 3, 2))
+        strides = (*values.stride()[:3], 0, 0, values.stride(3))
+    visible = torch.empty((B, V, N), dtype=torch.bool)
+    _values(call, values, strides, visible)
+    _run(call, backward=False)
+    del kept
+    return values, visible
+
+
+def _pixel_call(
+    source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options
+) -> tuple[_Call, tuple[Tensor | None, ...]]:
+    call = _start(PIXELS, source, options, (front.shape[-1], 1, 1))
+    pixels, front = pixels.float().contiguous(), front.contiguous()
+    extras = None if extra is None else extra.float().movedim(2, 3).contiguous()
+    call.pixels, call.front = pixels.data_ptr(), front.data_ptr()
+    call.extra = 0 if extras is None else extras.shape[3]
+    call.extras = None if extras is None else extras.data_ptr()
+    return call, (pixels, front, extras)
+
+
+def pixels_backward(
+    gradient: Tensor,
+    source: Tensor,
+    pixels: Tensor,
+    front: Tensor,
+    extra: Tensor | None,
+    options: Options,
+    needs: Sequence[bool],
+) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    """Vector-Jacobian product of `pixels` to source, pixels and extra, each in its dtype."""
+    original, source = source, _channels_last(source, 2)
+    call, kept = _pixel_call(source, pixels, front, extra, options)
+    strides = gradient.stride()
+    if options.reduce:
+        _gradient(call, gradient, (strides[0], 0, strides[1], 0, 0, strides[2]))
+    else:
+        _gradient(call, gradient, (*strides[:3], 0, 0, strides[3]))
+    to_source = _source_gradient(call, source, 2, None) if needs[0] else None
+    to_pixels = torch.zeros(call.chunks, *pixels.shape) if needs[1] else None
+    call.pixels_gradient = None if to_pixels is None else to_pixels.data_ptr()
+    to_extra = None
+    if needs[2] and extra is not None:
+        to_extra = torch.zeros(*front.shape, call.extra)
+        call.extras_gradient = to_extra.data_ptr()
+    _run(call, backward=True)
+    del kept
+    return (
+        None if to_source is None else to_source.to(original.dtype),
+        None if to_pixels is None else to_pixels.sum(0).to(pixels.dtype),
+        None if to_extra is None else to_extra.movedim(3, 2).to(extra.dtype),  # type: ignore[union-attr]
+    )
+
+
+def volume(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """`reference.plane_sweep_project`; `out` is memory of the answer's shape, any strides, to write to."""
+    source = _channels_last(source, 1)
+    counts = (sites.z.shape[-1], sites.y.shape[0], sites.x.shape[0])
+    call = _start(VOLUMES, source, options, counts[::-1])
+    kept = _place(call, sites, options)
+    shape = (call.scenes, call.views, source.shape[1] + call.depth + 3 * call.direction, *counts)
+    if out is None:
+        out = fresh(shape, source.dtype, (0, 1, 4, 5, 2, 3) if options.stacked else (0, 1, 3, 4, 5, 2))
+    visible = torch.empty((*shape[:2], *counts), dtype=torch.bool)
+    _values(call, out, out.stride(), visible)
+    _run(call, backward=False)
+    del kept
+    return out, visible
+
+
+def volume_backward(
+    gradient: Tensor,
+    source: Tensor,
+    sites: Sites,
+    options: Options,
+    needs: Sequence[bool],
+    into: Tensor | None = None,
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+    """Vector-Jacobian product of `volume`, as `images_backward`."""
+    original, source = source, _channels_last(source, 1)
+    counts = (sites.z.shape[-1], sites.y.shape[0], sites.x.shape[0])
+    call = _start(VOLUMES, source, options, counts[::-1])
+    kept = _place(call, sites, options)
+    _gradient(call, gradient, gradient.stride())
+    to_source = _source_gradient(call, source, 1, into) if needs[0] else None
+    parts = _geometry_gradients(call, (needs[1], needs[2] and bool(options.direction), needs[3]))
+    _run(call, backward=True)
+    del kept
+    if to_source is not None and into is None:
+        to_source = to_source.to(original.dtype)
+    return to_source, *_together(parts)  # type: ignore[return-value]

@@ -1,0 +1,262 @@
+// Fused resampling on the CPU: a C library without Python or PyTorch, bound by lsmgeo/kernels/cpu.py.
+//
+// resample.h is compiled for several instruction sets; the best that the machine has is taken when the library is loaded.
+// Work is split in tasks that write to places of their own, so that results depend neither on which thread runs which
+// task nor on their order.
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <cstring>
+#include <memory>
+#include <new>
+#include <system_error>
+#include <thread>
+#include <type_traits>
+#include <vector>
+
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
+#include "call.h"
+
+#if defined(_WIN32)
+#define EXPORT extern "C" __declspec(dllexport)
+#else
+#define EXPORT extern "C" __attribute__((visibility("default")))
+#endif
+
+// What is written with vectors has to be inlined, lest vectors be handed from function to function.
+#define INLINE inline __attribute__((always_inline))
+#define INLINED __attribute__((always_inline))
+
+namespace {
+
+// A camera, or what a volume is to a camera, in the scale in which the kernels compute.
+struct View {
+    double matrix[3][4], scale;              // M by a power of two that keeps M q from overflow
+    double direction[3][4], direction_scale; // G by a power of two that brings it near 1
+    double terms, terms_z;                   // bound on the terms of G q: terms + terms_z |z|
+    bool masked;
+};
+
+struct Plan {
+    const Call *call;
+    const View *views;       // (B, V)
+    int64_t channels;        // of a view's values, those of geometry among them
+    int64_t tiles, tiles_per_row, blocks;
+    bool along_z, backward;
+};
+
+struct Needs { int64_t tile, geometric, length; };
+
+// Memory for one thread.
+struct Room {
+    void *tiles, *geometric;
+    float *values, *reduced, *spread, *nothing;
+    int64_t *seen;
+};
+
+#define LANES 4
+namespace baseline {
+#include "resample.h"
+}
+
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
+#define VARIANTS 1
+#pragma GCC push_options
+#pragma GCC target("avx2,fma,f16c,bmi,bmi2")
+#undef LANES
+#define LANES 8
+namespace avx2 {
+#include "resample.h"
+}
+#pragma GCC pop_options
+#pragma GCC push_options
+#pragma GCC target("avx512f,avx512bw,avx512dq,avx512vl,avx2,fma,bmi,bmi2,prefer-vector-width=512")
+#undef LANES
+#define LANES 16
+namespace avx512 {
+#include "resample.h"
+}
+#pragma GCC pop_options
+#endif
+
+using Runner = void (*)(const Plan &, int64_t, Room &);
+struct InstructionSet { const char *name; Runner run; Needs needs; };
+
+// The sets that this machine can run, best first.
+std::vector<InstructionSet> available() {
+    std::vector<InstructionSet> sets;
+#if VARIANTS
+    __builtin_cpu_init();
+    const bool has_avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
+                          __builtin_cpu_supports("bmi2");
+    if (has_avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
+        sets.push_back({"avx512", avx512::run_task, avx512::needs()});
+    if (has_avx2) sets.push_back({"avx2", avx2::run_task, avx2::needs()});
+#endif
+    sets.push_back({"baseline", baseline::run_task, baseline::needs()});
+    return sets;
+}
+
+InstructionSet chosen = available().front();
+
+// Threads: those of an OpenMP runtime that PyTorch has loaded already, so that two pools do not fight for the cores.
+using OpenMp = void (*)(void (*)(void *), void *, unsigned, unsigned);
+OpenMp openmp = nullptr;
+
+template <class Body>
+void on_threads(int64_t threads, Body &body) {
+    auto call = [](void *argument) { (*static_cast<Body *>(argument))(); };
+    if (threads <= 1) return call(&body);
+    if (openmp) return openmp(call, &body, unsigned(threads), 0);
+    std::vector<std::thread> others;
+    for (int64_t number = 1; number < threads; number++) {
+        try {
+            others.emplace_back(call, &body);
+        } catch (const std::system_error &) {
+            break;  // fewer threads do the same work
+        }
+    }
+    call(&body);
+    for (auto &other : others) other.join();
+}
+
+double power_of_two_above(double value) { return std::exp2(std::ceil(std::log2(value))); }
+
+double largest_of(const double *values, int64_t count, int64_t stride = 1) {
+    double largest = 0.0;
+    for (int64_t number = 0; number < count; number++) largest = std::max(largest, std::fabs(values[number * stride]));
+    return largest;
+}
+
+void prepare(const Call &call, int64_t scene, int64_t number, double reach_x, double reach_y, View &view) {
+    const int64_t at = scene * call.views + number;
+    view.masked = call.view_mask && !call.view_mask[at];
+    const double reach_z =
+        largest_of(call.z + scene * call.z_stride[0] + number * call.z_stride[1], call.sites[2], call.z_stride[2]);
+    auto bound = [](const double *matrix, double *columns) {
+        for (int column = 0; column < 4; column++) columns[column] = largest_of(matrix + column, 3, 4);
+    };
+    double columns[4];
+    const double *matrix = call.matrix + 12 * at;
+    view.scale = 1.0;
+    if (call.kind == IMAGES) {
+        bound(matrix, columns);
+        const double extent = columns[0] * reach_x + columns[1] * reach_y + columns[2] * reach_z + columns[3];
+        if (extent > 0x1p100) view.scale = 1.0 / power_of_two_above(extent * 0x1p-100);
+    }
+    for (int entry = 0; entry < 12; entry++) view.matrix[entry / 4][entry % 4] = matrix[entry] * view.scale;
+    if (!call.direction) return;
+    const double *direction = call.direction_matrix + 12 * at;
+    const double largest = largest_of(direction, 12);
+    view.direction_scale = largest > 0.0 ? 1.0 / power_of_two_above(largest) : 1.0;
+    for (int entry = 0; entry < 12; entry++)
+        view.direction[entry / 4][entry % 4] = direction[entry] * view.direction_scale;
+    bound(&view.direction[0][0], columns);
+    view.terms = columns[0] * reach_x + columns[1] * reach_y + columns[3];
+    view.terms_z = columns[2];
+}
+
+// Run a call; nonzero when memory ran out.
+int run(const Call &call, bool backward) {
+    Plan plan = {};
+    plan.call = &call;
+    plan.backward = backward;
+    plan.channels = call.channels + call.depth + 3 * call.direction + call.extra;
+    // Tiles follow z where neighbours in z are neighbours in memory.
+    const int64_t *stride = backward ? call.gradient_stride : call.values_stride;
+    plan.along_z = call.kind == VOLUMES && call.sites[2] > 1 && stride[3] != 0 && stride[3] < stride[5];
+    const int64_t length = plan.along_z ? call.sites[2] : call.sites[0];
+    const int64_t sites = call.sites[0] * call.sites[1] * call.sites[2];
+    if (sites == 0 || call.scenes == 0 || call.views == 0) return 0;
+    plan.tiles_per_row = (length + chosen.needs.length - 1) / chosen.needs.length;
+    plan.tiles = sites / length * plan.tiles_per_row;
+    // A few thousand sites a task, fewer where each costs more.
+    const int64_t work = 1 + sites * (plan.channels + 16) * (call.statistics ? call.views : 1) / 131072;
+    plan.blocks = std::min(plan.tiles, work);
+    const int64_t parts = call.scenes * (call.statistics || (backward && call.kind == VOLUMES) ? 1 : call.views);
+    const int64_t tasks = parts * (backward ? call.chunks : plan.blocks);
+
+    std::unique_ptr<View[]> views(new (std::nothrow) View[size_t(call.scenes * call.views)]());
+    if (!views) return 1;
+    plan.views = views.get();
+    if (call.kind != PIXELS) {
+        const double reach_x = largest_of(call.x, call.sites[0]), reach_y = largest_of(call.y, call.sites[1]);
+        for (int64_t scene = 0; scene < call.scenes; scene++)
+            for (int64_t view = 0; view < call.views; view++)
+                prepare(call, scene, view, reach_x, reach_y, views[size_t(scene * call.views + view)]);
+    }
+
+    const int64_t tiles = call.statistics ? call.views : 1;
+    const int64_t statistics = std::max<int64_t>(call.statistics, 1);
+    const int64_t of_values = std::max(chosen.needs.length, call.statistics ? call.views : 0) * plan.channels;
+    const int64_t floats = 2 * of_values + statistics * chosen.needs.length * plan.channels + plan.channels;
+    const int64_t bytes = tiles * (chosen.needs.tile + chosen.needs.geometric) + 4 * floats + 8 * call.views + 256;
+    std::atomic<int64_t> next(0), failures(0);
+    auto body = [&]() {
+        std::unique_ptr<char[]> memory(new (std::nothrow) char[size_t(bytes)]);
+        if (!memory) {
+            failures++;
+            return;
+        }
+        Room room;
+        char *place = memory.get();
+        auto reserve = [&](int64_t size) {
+            place = reinterpret_cast<char *>((reinterpret_cast<uintptr_t>(place) + 15) & ~uintptr_t(15));
+            char *reserved = place;
+            place += size;
+            return reserved;
+        };
+        room.seen = reinterpret_cast<int64_t *>(reserve(8 * call.views));
+        room.tiles = reserve(tiles * chosen.needs.tile);
+        room.geometric = reserve(tiles * chosen.needs.geometric);
+        room.values = reinterpret_cast<float *>(reserve(4 * of_values));
+        room.spread = reinterpret_cast<float *>(reserve(4 * of_values));
+        room.reduced = reinterpret_cast<float *>(reserve(4 * statistics * chosen.needs.length * plan.channels));
+        room.nothing = reinterpret_cast<float *>(reserve(4 * plan.channels));
+        std::fill(room.nothing, room.nothing + plan.channels, 0.0f);
+        for (int64_t task = next++; task < tasks; task = next++) chosen.run(plan, task, room);
+    };
+    const int64_t threads = std::min(call.threads, tasks);
+    on_threads(threads, body);
+    return failures.load() >= std::max<int64_t>(threads, 1) ? 1 : 0;
+}
+
+}  // namespace
+
+EXPORT int lsmgeo_forward(const Call *call) { return run(*call, false); }
+
+EXPORT int lsmgeo_backward(const Call *call) { return run(*call, true); }
+
+EXPORT int64_t lsmgeo_size_of_call() { return int64_t(sizeof(Call)); }
+
+// Use this OpenMP runtime's threads: the address of its GOMP_parallel, or null for threads of our own.
+EXPORT void lsmgeo_use_openmp(void *parallel) { openmp = reinterpret_cast<OpenMp>(parallel); }
+
+// The instruction set in use; another can be asked for by name. Null if the machine does not have it.
+EXPORT const char *lsmgeo_instruction_set(const char *name) {
+    if (name)
+        for (const auto &set : available())
+            if (std::strcmp(set.name, name) == 0) {
+                chosen = set;
+                return chosen.name;
+            }
+    return name ? nullptr : chosen.name;
+}
+
+// Ask for huge pages: a fresh page of 4 KiB costs about as much as filling it.
+EXPORT void lsmgeo_use_huge_pages(void *start, int64_t bytes) {
+#if defined(__linux__) && defined(MADV_HUGEPAGE)
+    const uintptr_t huge = uintptr_t(1) << 21;
+    const uintptr_t first = (reinterpret_cast<uintptr_t>(start) + huge - 1) & ~(huge - 1);
+    const uintptr_t last = (reinterpret_cast<uintptr_t>(start) + uintptr_t(bytes)) & ~(huge - 1);
+    if (first < last) madvise(reinterpret_cast<void *>(first), last - first, MADV_HUGEPAGE);
+#else
+    (void)start;
+    (void)bytes;
+#endif
+}

@@ -130,13 +130,13 @@ def _pull_back_extras(g, lattice, points, sums, view, place, site, n, HOW: tl.co
         sums += ((view * n.planes + k) * n.blocks + site.block) * EXTRA_SUMS
         if HOW.depth:
             gd = tl.sum(tl.where(column == 0, g, 0.0), 1)
-            gd = tl.where(tl.abs(place.distance) <= LIMIT, gd, 0.0)
+            held = (tl.abs(place.distance) <= LIMIT) & _kept(lattice.views + view * FIELDS, site)
+            gd = tl.where(held, gd, 0.0)
             if HOW.kind == VOLUME:
                 _sum(sums + 3, gd, k, n, HOW)
             else:
                 along = tl.load(lattice.z + view * n.planes + site.k, mask=site.keep, other=1.0)
                 unit = tl.load(lattice.views + view * FIELDS + UNIT) * (along if HOW.projective else 1.0)
-                gd = tl.where(_kept(lattice.views + view * FIELDS, site), gd, 0.0)
                 row = tl.div_rn(gd, unit + tl.zeros_like(gd))
                 _sum(sums, row * site.x, k, n, HOW)
                 _sum(sums + 1, row * site.y, k, n, HOW)

@@ -222,7 +222,6 @@ def _inside(index, size):
 @triton.jit
 def _locate(lattice, points, view, site, n, near, HOW: tl.constexpr):
     """The `Place` of a program's sites in one view."""
-    table = lattice.views + view * FIELDS
     inverse = tl.zeros([HOW.sites], tl.float32)
     distance = inverse
     z = inverse
@@ -232,6 +231,7 @@ def _locate(lattice, points, view, site, n, near, HOW: tl.constexpr):
         x = tl.load(points.pixels + 2 * entry, mask=front, other=OUTSIDE)
         y = tl.load(points.pixels + 2 * entry + 1, mask=front, other=OUTSIDE)
     elif HOW.kind == VOLUME:
+        table = lattice.views + view * FIELDS
         kept = _kept(table, site)
         distance = tl.load(lattice.depth + view * n.planes + site.k, mask=kept, other=0.0)
         front = kept & (distance > near)
@@ -239,6 +239,7 @@ def _locate(lattice, points, view, site, n, near, HOW: tl.constexpr):
         y = _swept(table + 4, site, distance, front)
         z = _swept(table + 8, site, distance, front)
     else:
+        table = lattice.views + view * FIELDS
         kept = _kept(table, site)
         along = tl.load(lattice.z + view * n.planes + site.k, mask=site.keep, other=1.0)
         unit = tl.load(table + UNIT) + tl.zeros_like(along)

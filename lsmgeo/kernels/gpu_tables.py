@@ -87,7 +87,9 @@ def lattice_gradients(
     rows, through = tables.matrix.new_zeros(shape), tables.matrix.new_zeros(shape[:3])
     if index_sums is not None:
         rows = rows + index_sums.sum((2, 3), dtype=torch.float64).reshape(shape)
-    extra = None if extra_sums is None else extra_sums.sum(2, dtype=torch.float64).reshape(*shape[:3], -1)
+    extra = (
+        None if extra_sums is None else extra_sums.sum(2, dtype=torch.float64).reshape(*shape[:3], extra_sums.shape[-1])
+    )
     if tables.depth is not None:
         depth = tables.exact
         matrix = _outer_sums(rows, depth, torch.ones_like(depth))

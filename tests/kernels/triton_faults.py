@@ -1,0 +1,186 @@
+"""Realistic faults in the Triton kernels, as changes of their text: each must be noticed by a comparison.
+
+A fault is loaded as a module of its own, into which `gpu` looks for as long as the comparison lasts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import itertools
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+import torch
+
+from lsmgeo.kernels import gpu, gpu_tables
+from lsmgeo.kernels.request import Options
+from tests.kernels.triton_support import compare, features, image_sites, sweep_sites, volumes
+
+FOLDER = Path(gpu.__file__).parent
+KERNELS, GRADIENTS, TABLES = "gpu_kernels", "gpu_gradients", "gpu_tables"
+STATISTICS = ("mean", "variance", "max")
+COUNT = itertools.count()
+
+
+def _views() -> None:
+    sites = image_sites(20, batch=1, views=2, projective=True)
+    options = Options("bilinear", "border", depth=True, direction="world", near=1.0)
+    compare(features(2, batch=1, views=2), sites, options)
+
+
+def _zeros() -> None:
+    compare(features(2, batch=1, views=2), image_sites(21, batch=1, views=2), Options("bilinear"))
+
+
+def _masked() -> None:
+    compare(features(1, batch=1), image_sites(22, batch=1, mask=True), Options("nearest", depth=True))
+
+
+def _statistics() -> None:
+    compare(features(2, batch=1), image_sites(23, batch=1), Options("bilinear", reduce=STATISTICS))
+
+
+def _ties() -> None:
+    sites = image_sites(24, batch=1, views=2)
+    sites = sites._replace(matrix=sites.matrix[:, :1].expand(1, 2, 3, 4))
+    compare(features(2, batch=1, views=1).expand(1, 2, 2, 5, 7), sites, Options("bilinear", reduce=("max",)))
+
+
+def _sweep() -> None:
+    options = Options("trilinear", "border", depth=True, near=0.6)
+    compare(volumes(2, batch=1), sweep_sites(25, batch=1), options, volume=True)
+
+
+COMPARISONS = (_views, _zeros, _masked, _statistics, _ties, _sweep)
+
+
+class Fault(NamedTuple):
+    file: str
+    text: str
+    instead: str
+    noticed_by: Callable[[], None]
+
+
+CHANGES = {
+    "pixels half a pixel off": Fault(
+        KERNELS,
+        "x = tl.where(front, _row(table, site.x, site.y, along) * inverse, OUTSIDE)",
+        "x = tl.where(front, _row(table, site.x, site.y, along) * inverse + 0.5, OUTSIDE)",
+        _zeros,
+    ),
+    "the lower cell for the nearest": Fault(KERNELS, "index - cell >= 0.5", "index - cell >= 1.5", _masked),
+    "no test of what is in front": Fault(
+        KERNELS, "front = kept & (third > tl.maximum(near * unit, SMALLEST_DEPTH))", "front = kept", _views
+    ),
+    "near not in units of depth": Fault(KERNELS, "tl.maximum(near * unit,", "tl.maximum(near,", _views),
+    "no near plane in sweeps": Fault(KERNELS, "front = kept & (distance > near)", "front = kept", _sweep),
+    "depth without s": Fault(KERNELS, "unit = unit * along", "unit = unit * 1.0", _views),
+    "masked views taken in": Fault(
+        KERNELS, "return tl.where(site.keep, tl.load(table + KEPT), 0.0) != 0.0", "return site.keep", _masked
+    ),
+    "visible up to the outermost cells' neighbours": Fault(KERNELS, "(index >= -0.5)", "(index >= -1.0)", _zeros),
+    "the weight of another axis": Fault(
+        KERNELS,
+        "weight_y = cell.along_y if dy else 1.0 - cell.along_y",
+        "weight_y = cell.along_x if dy else 1.0 - cell.along_x",
+        _zeros,
+    ),
+    "the third axis not sampled": Fault(
+        KERNELS, "x, y, z = cell.x + dx, cell.y + dy, cell.z + dz", "x, y, z = cell.x + dx, cell.y + dy, cell.z", _sweep
+    ),
+    "a slope at the border": Fault(
+        KERNELS, "slope = tl.where((index > 0.0) & (index < size - 1.0), 1.0, 0.0)", "slope = slope", _sweep
+    ),
+    "shares of all views": Fault(KERNELS, "count += seen.to(tl.float32)", "count += 1.0", _statistics),
+    "unseen views in the mean": Fault(KERNELS, "kept = tl.where(seen, values, 0.0)", "kept = values", _statistics),
+    "squares about zero": Fault(
+        KERNELS, "place.visible[:, None], values - mean, 0.0", "place.visible[:, None], values, 0.0", _statistics
+    ),
+    "the last of equal views": Fault(KERNELS, "(values > best)", "(values >= best)", _ties),
+    "a derivative of the wrong sign": Fault(
+        GRADIENTS, "(1.0 if corner // 2 % 2 else -1.0)", "(-1.0 if corner // 2 % 2 else 1.0)", _zeros
+    ),
+    "a quotient's derivative of the wrong sign": Fault(
+        GRADIENTS, "gz = -(gx * x + gy * y) * place.inverse", "gz = (gx * x + gy * y) * place.inverse", _zeros
+    ),
+    "directions not normalised in backward": Fault(GRADIENTS, "(gx - along * x) * inverse", "gx * inverse", _views),
+    "half of the variance's derivative": Fault(
+        GRADIENTS, "2.0 * deviation * of_square", "deviation * of_square", _statistics
+    ),
+    "gradients to views that see nothing": Fault(
+        GRADIENTS, "g = tl.where(place.visible[:, None], g, 0.0)", "g = g", _statistics
+    ),
+    "masked depths with a gradient": Fault(
+        GRADIENTS, " & _kept(lattice.views + view * FIELDS, site)", " & site.keep", _masked
+    ),
+    "no gradient through s": Fault(TABLES, "through = -extra[..., 3] / z", "through = through", _views),
+    "a sweep's offset taken for a slope": Fault(
+        TABLES, "_outer_sums(rows, depth, torch.ones_like(depth))", "_outer_sums(rows, depth, depth)", _sweep
+    ),
+    "depth's gradient left on its inverse": Fault(TABLES, "-along * depth.square()", "-along", _sweep),
+}
+
+
+def _load(name: str, text: str, folder: Path) -> ModuleType:
+    """A module of this text, which Triton wants to find in a file."""
+    path = folder / f"{name}.py"
+    path.write_text(text)
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    sys.modules[name] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@contextlib.contextmanager
+def broken(fault: Fault | None) -> Iterator[None]:
+    """Make `gpu` use modules with the fault; modules loaded the same way without one if None."""
+    texts = {name: (FOLDER / f"{name}.py").read_text() for name in (KERNELS, GRADIENTS, TABLES)}
+    if fault is not None:
+        assert texts[fault.file].count(fault.text) >= 1, f"not to be found: {fault.text}"
+        texts[fault.file] = texts[fault.file].replace(fault.text, fault.instead)
+    names = {name: f"{name}_{next(COUNT)}" for name in texts}
+    texts[GRADIENTS] = texts[GRADIENTS].replace(f"lsmgeo.kernels.{KERNELS}", names[KERNELS])
+    before = {name: getattr(gpu, name) for name in ("_kernels", "tables", "lattice_gradients")}
+    with tempfile.TemporaryDirectory() as folder:
+        kernels, gradients, tables = (_load(names[name], texts[name], Path(folder)) for name in texts)
+        gpu._kernels = lambda: (kernels, gradients)
+        gpu.tables, gpu.lattice_gradients = tables.tables, tables.lattice_gradients
+        try:
+            yield
+        finally:
+            vars(gpu).update(before)
+            for name in names.values():
+                sys.modules.pop(name)
+
+
+def _sound() -> None:
+    """Without a fault every comparison passes."""
+    assert gpu.tables is gpu_tables.tables
+    with broken(None):
+        assert gpu.tables is not gpu_tables.tables
+        for comparison in COMPARISONS:
+            comparison()
+    assert gpu.tables is gpu_tables.tables
+
+
+def _noticed(fault: Fault) -> Callable[[], None]:
+    def check() -> None:
+        with broken(fault):
+            try:
+                fault.noticed_by()
+            except AssertionError:
+                return
+        raise AssertionError(f"{fault.noticed_by.__name__} does not notice it")
+
+    return check
+
+
+FAULTS = {"none": _sound} | {name: _noticed(fault) for name, fault in CHANGES.items()}
+torch.set_num_threads(1)

@@ -1,0 +1,241 @@
+"""Ugly little scenes for the Triton kernels, and the comparison of a call and its gradients with the reference.
+
+Judged by the reference in float64: the kernels may be a few times as far from it as the reference in float32 is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lsmgeo._dtypes import computing_dtype, saturating_cast
+from lsmgeo.kernels import gpu, reference
+from lsmgeo.kernels.request import Options, Sites
+from lsmgeo.kernels.statistics import view_statistics
+from tests import tolerances
+
+B, V = 2, 3
+SHAPE = (2, 3, 4)  # D, H, W
+IMAGE = (5, 7)
+CELLS = (4, 5, 6)
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def rotations(random: torch.Generator, *leading: int) -> Tensor:
+    q, r = torch.linalg.qr(torch.randn(*leading, 3, 3, generator=random, dtype=torch.float64))
+    q = q * r.diagonal(dim1=-2, dim2=-1).sign()[..., None, :]
+    return q * torch.linalg.det(q)[..., None, None]
+
+
+def _z(random: torch.Generator, depths: Tensor, leading: Sequence[int]) -> Tensor:
+    return depths * (1.0 + 0.2 * torch.rand(*leading, 1, generator=random, dtype=torch.float64))
+
+
+def image_sites(
+    seed: int = 0,
+    *,
+    batch: int = B,
+    views: int = V,
+    shape: tuple[int, int, int] = SHAPE,
+    projective: bool = False,
+    per: str = "all",
+    mask: bool = False,
+) -> Sites:
+    """A turned lattice before skewed cameras, a part of it behind them and a part beside their images."""
+    random = generator(seed)
+    K = torch.tensor([[5.0, 0.9, 3.1], [0.0, 4.0, 1.8], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    E = torch.cat((rotations(random, batch, views), torch.zeros(batch, views, 3, 1, dtype=torch.float64)), -1)
+    E[..., 2, 3] = 0.9 + torch.rand(batch, views, generator=random, dtype=torch.float64)
+    D, H, W = shape
+    axes = rotations(random, batch, 1) * torch.tensor([1.9 / W, 1.7 / H, 1.5 / D], dtype=torch.float64)
+    origin = -axes @ torch.tensor([(W - 1) / 2, (H - 1) / 2, (D - 1) / 2], dtype=torch.float64)
+    T = torch.zeros(batch, 1, 4, 4, dtype=torch.float64)
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = axes, origin, 1.0
+    z = torch.arange(D, dtype=torch.float64)
+    if projective:  # X = origin + depth (x a + y b + c), of which 1 / depth is the third coordinate
+        T = torch.cat((T[..., :2], T[..., 3:], T[..., 2:3]), -1)
+        T[..., 3, :] = torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=torch.float64)
+        z = 1.0 / torch.linspace(0.3, 1.4, D, dtype=torch.float64)
+    leading = {"all": (), "scene": (batch,), "view": (batch, views)}[per]
+    view_mask = None
+    if mask:
+        view_mask = torch.ones(batch, views, dtype=torch.bool)
+        view_mask[0, 0] = view_mask[-1, -1] = False
+    x, y = torch.arange(W, dtype=torch.float64), torch.arange(H, dtype=torch.float64)
+    M = K @ (E @ T)
+    center = -(E[..., :3].mT @ E[..., 3:])
+    G = T[..., :3, :] - center * T[..., 3:, :]
+    return Sites(M, G, x, y, _z(random, z, leading) if leading else z, projective, view_mask)
+
+
+def sweep_sites(
+    seed: int = 0,
+    *,
+    batch: int = B,
+    views: int = 2,
+    shape: tuple[int, int, int] = SHAPE,
+    cells: tuple[int, int, int] = CELLS,
+    per: str = "all",
+    mask: bool = False,
+) -> Sites:
+    """Frustums that cross a volume, and leave it."""
+    random = generator(seed)
+    P, h, w = shape
+    turned = rotations(random, batch, views) * (torch.tensor(cells[::-1], dtype=torch.float64)[:, None] * 0.5)
+    M = torch.zeros(batch, views, 3, 4, dtype=torch.float64)
+    M[..., 0], M[..., 1] = turned[..., 0] / w, turned[..., 1] / h
+    M[..., 3] = turned[..., 2] - 0.5 * turned[..., 0] - 0.5 * turned[..., 1]
+    M[..., 2] = 0.45 * torch.tensor(cells[::-1], dtype=torch.float64) - 1.1 * turned[..., 2]
+    z = 1.0 / torch.linspace(0.5, 1.9, P, dtype=torch.float64)
+    leading = {"all": (), "scene": (batch,), "view": (batch, views)}[per]
+    view_mask = None
+    if mask:
+        view_mask = torch.ones(batch, views, dtype=torch.bool)
+        view_mask[0, 0] = False
+    G = torch.randn(batch, views, 3, 4, generator=random, dtype=torch.float64)
+    x, y = torch.arange(w, dtype=torch.float64), torch.arange(h, dtype=torch.float64)
+    return Sites(M, G, x, y, _z(random, z, leading) if leading else z, True, view_mask)
+
+
+def features(channels: int = 3, seed: int = 7, batch: int = B, views: int = V, dtype: Any = torch.float32) -> Tensor:
+    return torch.randn(batch, views, channels, *IMAGE, generator=generator(seed)).to(dtype)
+
+
+def volumes(channels: int = 3, seed: int = 7, batch: int = B, dtype: Any = torch.float32) -> Tensor:
+    return torch.randn(batch, channels, *CELLS, generator=generator(seed)).to(dtype)
+
+
+class Points(NamedTuple):
+    pixels: Tensor
+    front: Tensor
+    extra: Tensor | None
+
+
+def points(seed: int = 3, extras: int = 2, count: int = 11) -> Points:
+    """Pixels within and beside the images, some of sites not in front."""
+    random = generator(seed)
+    pixels = torch.rand(B, V, count, 2, generator=random) * torch.tensor([9.0, 7.0]) - 1.5
+    front = torch.rand(B, V, count, generator=random) > 0.2
+    extra = torch.randn(B, V, extras, count, generator=random) if extras else None
+    return Points(pixels, front, extra)
+
+
+# Both sides of the comparison as functions of the source and what else has gradients
+
+
+def sample_pixels(source: Tensor, given: Points, options: Options) -> tuple[Tensor, Tensor]:
+    """What `gpu.pixels` means, by the reference's parts."""
+    dtype, output = computing_dtype(source), source.dtype
+    index = [torch.where(given.front, axis, -2.0) for axis in given.pixels.to(dtype).unbind(-1)]
+    values, visible = reference._sample(source.to(dtype), index, given.front, options)
+    blocks = [values] if given.extra is None else [values, given.extra.to(dtype)]
+    if options.reduce:
+        return saturating_cast(view_statistics(torch.cat(blocks, 2), visible, options.reduce), output), visible
+    return torch.cat([saturating_cast(block, output) for block in blocks], 2), visible
+
+
+Answer = tuple[Tensor, Tensor, list[Tensor | None]]  # values, visible, gradients
+
+
+def by_reference(
+    operator: Callable[..., tuple[Tensor, Tensor]], source: Tensor, place: Any, options: Options, cotangent: Tensor
+) -> Answer:
+    source = source.detach().clone().requires_grad_()
+    if isinstance(place, Sites):
+        M, G = place.matrix.clone().requires_grad_(), place.direction
+        G = None if G is None else G.clone().requires_grad_()
+        z = reference._per_view(place.z, place.matrix).clone().requires_grad_()
+        leaves, place = (M, G, z), place._replace(matrix=M, direction=G, z=z)
+    else:
+        leaves = tuple(leaf if leaf is None else leaf.clone().requires_grad_() for leaf in (place.pixels, place.extra))
+        place = Points(leaves[0], place.front, leaves[1])
+    values, visible = operator(source, place, options)
+    wanted = [leaf for leaf in (source, *leaves) if leaf is not None]
+    found = iter(torch.autograd.grad(values, wanted, cotangent.to(values.dtype), allow_unused=True))
+    gradients = [None if leaf is None else next(found) for leaf in (source, *leaves)]
+    return values.detach(), visible, gradients
+
+
+def by_kernels(source: Tensor, place: Any, options: Options, cotangent: Tensor, **given: Any) -> Answer:
+    needs = (True,) * 4
+    if not isinstance(place, Sites):
+        values, visible = gpu.pixels(source, *place, options)
+        return values, visible, list(gpu.pixels_backward(cotangent, source, *place, options, needs[:3]))
+    if options.mode == "trilinear" or given.get("volume"):
+        values, visible = gpu.volume(source, place, options, given.get("out"))
+        gradients = gpu.volume_backward(cotangent, source, place, options, needs, given.get("into"))
+    else:
+        values, visible = gpu.images(source, place, options)
+        gradients = gpu.images_backward(cotangent, source, place, options, needs)
+    return values, visible, list(gradients)
+
+
+def close(found: Tensor, expected: Tensor, single: Tensor, dtype: torch.dtype = torch.float32) -> None:
+    """Within a few times the error of the reference in float32, in the largest norm."""
+    assert found.shape == expected.shape, (found.shape, expected.shape)
+    if not expected.numel():
+        return
+    expected, single = expected.double(), single.double()
+    largest = float(expected.abs().max())
+    storage = 0.0 if dtype == torch.float32 else 2.0 * tolerances.UNIT_ROUNDOFF[dtype]
+    rounding = tolerances.VALUE_FACTOR * tolerances.UNIT_ROUNDOFF[torch.float32] + storage
+    atol = tolerances.FACTOR[torch.float32] * float((single - expected).abs().max()) + rounding * largest
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=atol)
+
+
+def compare(
+    source: Tensor,
+    place: Any,
+    options: Options,
+    *,
+    cotangent: Tensor | None = None,
+    seed: int = 5,
+    volume: bool = False,
+    seen: bool = True,
+    **given: Any,
+) -> Answer:
+    """Require values, visibility and every gradient to be the reference's; returns what the kernels gave.
+
+    Args:
+        source: of the call.
+        place: `Sites`, or `Points`.
+        options: of the call.
+        cotangent: the incoming gradient; random if None.
+        seed: of the cotangent.
+        volume: whether the sites are frustums.
+        seen: require that some sites are visible and some are not.
+        **given: to the kernels.
+    """
+    operator: Any = reference.plane_sweep_project if volume else reference.unproject
+    if not isinstance(place, Sites):
+        operator = sample_pixels
+    plain = replace(options, stacked=False)
+    with torch.no_grad():
+        shape = operator(source, place, plain)[0].shape
+    if cotangent is None:
+        cotangent = torch.randn(shape, generator=generator(seed)).to(source.dtype)
+    values, visible, gradients = by_reference(operator, source.float(), place, plain, cotangent.float())
+    exact, _, derivatives = by_reference(operator, source.double(), place, plain, cotangent.double())
+    found = by_kernels(source, place, options, cotangent, volume=volume, **given)
+    if seen and (bool(visible.all()) or not bool(visible.any())):
+        raise ValueError("a scene of which everything is visible, or nothing, tells little")
+    torch.testing.assert_close(found[1], visible, rtol=0, atol=0)
+    close(found[0], exact, values, source.dtype)
+    assert len(found[2]) == len(derivatives)
+    assert found[2][0] is None or found[2][0].dtype == (
+        torch.float32 if given.get("into") is not None else source.dtype
+    )
+    for place_of, (gradient, expected, single) in enumerate(zip(found[2], derivatives, gradients, strict=True)):
+        if expected is None or single is None:  # does not depend on it
+            assert gradient is None or not bool(gradient.any())
+        elif place_of or given.get("into") is None:
+            assert gradient is not None
+            close(gradient, expected, single, source.dtype)
+    return found

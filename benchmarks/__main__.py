@@ -1,7 +1,14 @@
-"""All benchmarks: ``python -m benchmarks``."""
+"""All benchmarks: ``python -m benchmarks``; with ``--quick``, whether they work."""
 
-from benchmarks import imports, operators
+import sys
+import time
+
+from benchmarks import footprint, growth, imports, operators, systems
 
 if __name__ == "__main__":
-    operators.main([])
-    imports.main([])
+    started = time.perf_counter()
+    for module in (operators, footprint, systems, growth):
+        module.main(sys.argv[1:])
+    if "--quick" not in sys.argv:
+        imports.main([])
+    print(f"{(time.perf_counter() - started) / 60:.1f} minutes")

@@ -15,20 +15,54 @@ from typing import Any
 import torch
 
 RESULTS = Path(__file__).parent / "results"
+FEWEST, MOST = 5, 31
 
 
-def interleaved(runs: Mapping[str, Callable[[], Any]], repeats: int, warm_up: int = 2) -> dict[str, list[float]]:
-    """Seconds of each run: one after another in turn, so that a busy moment meets all alike; the order alternates."""
-    seconds: dict[str, list[float]] = {name: [] for name in runs}
-    for repeat in range(-warm_up, repeats):
-        for name in list(runs)[:: 1 if repeat % 2 else -1]:
-            start = time.perf_counter()
-            runs[name]()
-            if torch.cuda.is_available():
-                torch.cuda.synchronize()
-            if repeat >= 0:
-                seconds[name].append(time.perf_counter() - start)
-    return seconds
+def seconds_of(run: Callable[[], Any], device: str = "cpu") -> float:
+    """Seconds of one call: by the clock on a CPU, by events on a GPU."""
+    if device == "cuda":
+        begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        begin.record()
+        run()
+        end.record()
+        end.synchronize()
+        return begin.elapsed_time(end) * 1e-3
+    start = time.perf_counter()
+    result = run()
+    del result  # giving its memory back is part of the call
+    return time.perf_counter() - start
+
+
+def interleaved(
+    runs: Mapping[str, Callable[[], Any]],
+    repeats: int | None = None,
+    warm_up: int = 1,
+    budget: float = 10.0,
+    device: str = "cpu",
+) -> dict[str, list[float]]:
+    """Seconds of each run: one after another in turn, so that a busy moment meets all alike; the order alternates.
+
+    Without `repeats` there are as many rounds as fit into `budget` seconds, between `FEWEST` and `MOST`.
+    """
+    names = list(runs)
+
+    def turn(number: int) -> dict[str, float]:
+        return {name: seconds_of(runs[name], device) for name in names[:: 1 if number % 2 else -1]}
+
+    spent = 0.0
+    for number in range(warm_up):
+        spent = sum(turn(number).values())
+    if repeats is None:
+        repeats = min(MOST, max(FEWEST, int(budget / max(spent, 1e-6))))
+    rounds = [turn(number) for number in range(repeats)]
+    return {name: [taken[name] for taken in rounds] for name in names}
+
+
+def spread(seconds: list[float]) -> dict[str, Any]:
+    """Median and quartiles, in milliseconds."""
+    quartiles = statistics.quantiles(seconds, n=4) if len(seconds) > 1 else 3 * seconds
+    low, middle, high = (1e3 * value for value in quartiles)
+    return {"median_ms": middle, "quartiles_ms": [low, high], "rounds": len(seconds)}
 
 
 def summary(seconds: Mapping[str, list[float]]) -> dict[str, Any]:
@@ -54,24 +88,43 @@ def processor() -> str:
         return platform.processor() or platform.machine()
 
 
+def huge_pages() -> str:
+    """When the system gives huge pages: "always", "madvise", "never", or "unknown"."""
+    try:
+        text = Path("/sys/kernel/mm/transparent_hugepage/enabled").read_text(encoding="ascii")
+        return text.split("[")[1].split("]")[0]
+    except (OSError, IndexError):
+        return "unknown"
+
+
 def machine(device: str) -> dict[str, Any]:
     """Where and when something was timed."""
+    import kornia
+
+    import lsmgeo
+
     return {
         "device": torch.cuda.get_device_name() if device == "cuda" else processor(),
+        "vector_instructions": torch.backends.cpu.get_cpu_capability(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
+        "huge_pages": huge_pages(),
         "load_before": os.getloadavg()[0],
+        "system": f"{platform.system()} {platform.release()}",
+        "lsmgeo": lsmgeo.__version__,
         "torch": torch.__version__,
+        "kornia": kornia.__version__,
         "python": platform.python_version(),
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d"),
     }
 
 
-def save(name: str, where: Mapping[str, Any], cases: list[dict[str, Any]]) -> Path:
+def save(name: str, where: Mapping[str, Any], cases: list[dict[str, Any]], folder: Path = RESULTS, **more: Any) -> Path:
     """Write results as JSON; returns the path."""
-    RESULTS.mkdir(exist_ok=True)
-    path = RESULTS / f"{name}.json"
-    path.write_text(json.dumps({"machine": where, "cases": cases}, indent=2) + "\n", encoding="utf-8")
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}.json"
+    text = json.dumps({"machine": where, **more, "cases": cases}, indent=1, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8")
     return path
 
 

@@ -1,0 +1,263 @@
+"""The gather form, compiled: index a channels-last table at the taps of each sample, add them up with their weights.
+
+`torch.compile` gains nothing on `grid_sample`; as a gather, projection, taps and sum become one vectorised loop. The
+backward that it makes of that adds atomically on the threads of a CPU, which costs more than they win. So backward is a
+second graph, compiled for one thread there, that computes the taps again and passes once over the gradient.
+`contender(scene, automatic=True)` is the backward that `torch.compile` makes by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from benchmarks.problems import IMAGE, LeftOut, Run, Scene
+from benchmarks.rivals import NEAR, feature_intrinsics
+
+MOST_VIEWS = 8  # statistics unroll the views; beyond, compiling takes minutes
+
+
+def require_compiler() -> None:
+    """Raise `LeftOut` where nothing can be compiled for a CPU."""
+    try:
+        from torch._inductor.cpp_builder import get_cpp_compiler
+
+        get_cpp_compiler()
+    except Exception as error:  # whatever is missing, the rival is left out
+        raise LeftOut(f"no C++ compiler at run time ({type(error).__name__})") from error
+
+
+class Samples(NamedTuple):
+    """Positions (B, V, N) along each axis of an array, the fastest axis first."""
+
+    index: list[Tensor]
+    sizes: list[int]
+    front: Tensor
+    first: Tensor  # of the table's rows: where the array starts
+
+    def visible(self) -> Tensor:
+        seen = self.front
+        for axis, n in zip(self.index, self.sizes, strict=True):
+            seen = seen & (axis >= -0.5) & (axis < n - 0.5)
+        return seen
+
+    def of_view(self, v: int) -> Samples:
+        return Samples([axis[:, v] for axis in self.index], self.sizes, self.front[:, v], self.first[:, v])
+
+    def corners(self, mode: str) -> int:
+        return 1 if mode == "nearest" else 2 ** len(self.index)
+
+    def tap(self, mode: str, corner: int | Tensor) -> tuple[Tensor, Tensor]:
+        """A row of the table and its weight; both (..., corners) where `corner` holds several."""
+        index, inside, first = self.index, self.front, self.first
+        if isinstance(corner, Tensor):
+            index, inside, first = [axis[..., None] for axis in index], inside[..., None], first[..., None]
+        row, weight = torch.zeros_like(first), torch.ones_like(index[0])
+        stride = 1
+        for position, (axis, n) in enumerate(zip(index, self.sizes, strict=True)):
+            if mode == "nearest":
+                cell = (axis + 0.5).floor()
+            else:
+                low, high = axis.floor(), (corner >> position) & 1
+                cell = low + high
+                weight = weight * (1.0 - high - (axis - low)).abs()  # the fraction above, what is left of 1 below
+            inside = inside & (cell >= 0) & (cell < n)
+            row = row + stride * cell.clamp(0, n - 1).to(torch.int64)
+            stride = stride * n
+        return row + first, torch.where(inside, weight, 0.0)
+
+
+Find = Callable[..., Samples]
+
+
+def image_samples(P: Tensor, points: Tensor, side: int) -> Samples:
+    """Points (B or 1, N, 3) in images (B, V) of side x side pixels."""
+    X, Y, Z = points[:, None].unbind(-1)  # (B or 1, 1, N)
+    x, y, depth = (
+        P[..., i, 0, None] * X + P[..., i, 1, None] * Y + P[..., i, 2, None] * Z + P[..., i, 3, None] for i in range(3)
+    )
+    front = depth > NEAR
+    inverse = 1.0 / torch.where(front, depth, 1.0)
+    B, V = P.shape[:2]
+    first = torch.arange(B * V, device=P.device).reshape(B, V, 1) * side**2
+    return Samples([x * inverse, y * inverse], [side, side], front, first)
+
+
+def volume_samples(center: Tensor, rays: Tensor, depths: Tensor, side: int) -> Samples:
+    """``center + depth ray``, in index units, in volumes (B,) of side^3 voxels."""
+    index = [(center[..., i, None, None] + depths[:, None] * rays[..., None, :, i]).flatten(2) for i in range(3)]
+    B, V = center.shape[:2]
+    first = (torch.arange(B, device=center.device)[:, None, None] * side**3).expand(B, V, 1)
+    return Samples(index, [side, side, side], torch.ones_like(index[0], dtype=torch.bool), first)
+
+
+def blend(table: Tensor, samples: Samples, mode: str) -> Tensor:
+    """Rows of (rows, C), weighted and added: (..., C)."""
+    value = 0.0
+    for corner in range(samples.corners(mode)):
+        row, weight = samples.tap(mode, corner)
+        value = value + table[row].float() * weight[..., None]
+    return value
+
+
+def scatter(table: Tensor, values: Tensor, samples: Samples, mode: str) -> Tensor:
+    """The adjoint of `blend`: values (..., C) added to the table's rows, all taps of a sample in one pass."""
+    row, weight = samples.tap(mode, torch.arange(samples.corners(mode), device=table.device))
+    return table.index_put((row,), values[..., None, :] * weight[..., None], accumulate=True)
+
+
+def share(visible: Tensor) -> Tensor:
+    """1 over the number of views that see a site: (B, N)."""
+    return 1.0 / visible.sum(1).clamp(min=1).float()
+
+
+def forward_of(statistic: str, find: Find, mode: str) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
+    """(table, geometry) to values, visibility and the views' mean, which the variance's backward needs."""
+
+    def forward(table: Tensor, *geometry: Any) -> tuple[Tensor, Tensor, Tensor]:
+        samples = find(*geometry)
+        visible = samples.visible()
+        if not statistic:
+            return blend(table, samples, mode).to(table.dtype), visible, table.new_zeros(())  # (B, V, N, C)
+        total, squares = 0.0, 0.0
+        for v in range(visible.shape[1]):
+            value = blend(table, samples.of_view(v), mode) * visible[:, v, :, None]
+            total, squares = total + value, squares + value * value
+        mean = total * share(visible)[..., None]
+        if statistic == "mean":
+            return mean.to(table.dtype), visible, table.new_zeros(())
+        return (squares * share(visible)[..., None] - mean * mean).to(table.dtype), visible, mean
+
+    return forward
+
+
+def spread_of(statistic: str, find: Find, mode: str) -> Callable[..., Tensor]:
+    """The gradient of a statistic, (B, N, C), as one to the values of each view."""
+
+    def spread(table: Tensor, gradient: Tensor, mean: Tensor, *geometry: Any) -> Tensor:
+        samples = find(*geometry)
+        visible = samples.visible()
+        scale = (share(visible)[:, None] * visible)[..., None]
+        if statistic == "mean":
+            return scale * gradient[:, None]
+        return 2.0 * (blend(table, samples, mode) - mean[:, None]) * scale * gradient[:, None]
+
+    return spread
+
+
+def backward_of(find: Find, mode: str) -> Callable[..., Tensor]:
+    """The gradient of the views' values as one to the table."""
+
+    def backward(table: Tensor, gradient: Tensor, *geometry: Any) -> Tensor:
+        added = scatter(torch.zeros_like(table, dtype=torch.float32), gradient.float(), find(*geometry), mode)
+        return added.to(table.dtype)
+
+    return backward
+
+
+@dataclass(frozen=True)
+class Graphs:
+    """What is compiled for one kind of call."""
+
+    forward: Callable[..., Any]
+    spread: Callable[..., Any]
+    backward: Callable[..., Any]
+    turn: Callable[..., Any]
+
+
+@lru_cache
+def compiled(operator: str, statistic: str, mode: str, dynamic: bool, device: str) -> Graphs:
+    """Forward, a statistic's gradient to each view, backward, and a transposition, which PyTorch does slowly itself."""
+    find = volume_samples if operator == "sweep" else image_samples
+    torch._dynamo.config.recompile_limit = 64
+    options = {"cpp.threads": 1} if device == "cpu" else None
+    return Graphs(
+        torch.compile(forward_of(statistic, find, mode), dynamic=dynamic),
+        torch.compile(spread_of(statistic, find, mode), dynamic=dynamic),
+        torch.compile(backward_of(find, mode), dynamic=dynamic, options=options),
+        torch.compile(lambda values: values.transpose(-1, -2).contiguous(), dynamic=dynamic),
+    )
+
+
+class Gather(torch.autograd.Function):
+    """A compiled forward with a compiled backward; values (..., N, C), or (..., C, N) where `planar`."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, graphs: Graphs, statistic: str, planar: bool, *geometry: Any) -> Any:
+        values, visible, mean = graphs.forward(table, *geometry)
+        ctx.save_for_backward(table, mean)
+        ctx.call = graphs, statistic, planar, geometry
+        ctx.mark_non_differentiable(visible)
+        return graphs.turn(values) if planar else values, visible
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor, _: Any) -> tuple[Any, ...]:
+        graphs, statistic, planar, geometry = ctx.call
+        table, mean = ctx.saved_tensors
+        if planar:
+            gradient = graphs.turn(gradient)
+        if statistic:
+            gradient = graphs.spread(table, gradient, mean, *geometry)
+        return graphs.backward(table, gradient, *geometry), *(None,) * (3 + len(geometry))
+
+
+def contender(scene: Scene, dynamic: bool = False, automatic: bool = False) -> Run:
+    """The compiled gather form of a problem."""
+    problem = scene.problem
+    if problem.operator == "reduce" or problem.statistic not in ("", "mean", "variance"):
+        raise LeftOut("not written")
+    if problem.statistic and problem.V > MOST_VIEWS:
+        raise LeftOut(f"unrolls the views; more than {MOST_VIEWS} take minutes to compile")
+    if problem.device == "cpu":
+        require_compiler()
+    K, E = scene.cameras.intrinsics, scene.cameras.cam_from_world
+    image, size = (IMAGE, IMAGE), (problem.size, problem.size)
+    planar = problem.operator == "sweep" and problem.flatten
+    operator = "sweep" if problem.operator == "sweep" else "images"
+    graphs = compiled(operator, problem.statistic, problem.mode, dynamic, problem.device)
+
+    def gather(table: Tensor, *geometry: Any) -> tuple[Tensor, Tensor]:
+        if automatic:
+            values, visible, _ = graphs.forward(table, *geometry)
+            return values.transpose(-1, -2).contiguous() if planar else values, visible
+        return Gather.apply(table, graphs, problem.statistic, planar, *geometry)
+
+    def lifted(features: Tensor) -> tuple[Tensor, Tensor]:
+        table = features.movedim(2, -1).reshape(-1, problem.C)  # a copy unless channels are innermost
+        P = feature_intrinsics(K, image, size) @ E[..., :3, :]
+        centers = scene.grid.centers().to(K)
+        sites = centers.shape[-4:-1]
+        points = centers.reshape(*(centers.shape[:-4] or (1,)), -1, 3)
+        values, visible = gather(table, P, points, problem.size)
+        values = values.movedim(-1, -2)
+        return values.unflatten(-1, sites), visible.unflatten(-1, sites)
+
+    def swept(volume: Tensor) -> tuple[Tensor, Tensor]:
+        table = volume.movedim(1, -1).reshape(-1, problem.C)
+        center, rays = sweep_lines(scene)
+        values, visible = gather(table, center, rays, scene.depths, problem.voxels)
+        sites = (problem.planes, *size)
+        if planar:  # (B, V, C, N)
+            return values.unflatten(-1, sites).flatten(2, 3), visible.unflatten(-1, sites)
+        return values.movedim(-1, -2).unflatten(-1, sites), visible.unflatten(-1, sites)
+
+    return swept if problem.operator == "sweep" else lifted
+
+
+def sweep_lines(scene: Scene) -> tuple[Tensor, Tensor]:
+    """Centre (B, V, 3) and rays (B, V, h w, 3) of every pixel, in the volume's index units."""
+    problem = scene.problem
+    K, E = scene.cameras.intrinsics, scene.cameras.cam_from_world
+    side = torch.arange(problem.size, dtype=K.dtype, device=K.device)
+    v, u = torch.meshgrid(side, side, indexing="ij")
+    pixels = torch.stack((u, v, torch.ones_like(u)), -1).reshape(-1, 3)
+    rotation, translation = E[..., :3, :3], E[..., :3, 3]
+    K = feature_intrinsics(K, (IMAGE, IMAGE), (problem.size, problem.size))
+    to_world = rotation.transpose(-1, -2) @ torch.linalg.inv(K)
+    center = -(rotation.transpose(-1, -2) @ translation[..., None])[..., 0]
+    return (center + 0.5) * problem.voxels - 0.5, pixels @ to_world.transpose(-1, -2) * problem.voxels

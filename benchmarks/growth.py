@@ -1,0 +1,90 @@
+"""How cost grows along one axis at a time: ``python -m benchmarks.growth``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from benchmarks import contenders as who
+from benchmarks import memory, report, timing
+from benchmarks.measure import timings
+from benchmarks.problems import Problem
+from benchmarks.settings import Settings, parse
+
+BASES = {
+    "Unproject, mean": Problem("unproject", B=1, statistic="mean"),
+    "Sweep, trilinear": Problem("sweep", B=1, size=56),
+}
+AXES: dict[str, dict[str, tuple[Any, ...]]] = {
+    "Unproject, mean": {
+        "voxels": (16, 32, 64, 128),
+        "V": (1, 2, 4, 8, 16, 32),
+        "C": (8, 16, 32, 64, 128),
+        "size": (28, 56, 112, 224),
+        "dtype": ("float32", "bfloat16", "float16"),
+        "threads": (1, 2),
+    },
+    "Sweep, trilinear": {
+        "voxels": (16, 32, 64, 128),
+        "V": (1, 4, 16),
+        "C": (8, 32, 128),
+        "size": (28, 56, 112),
+        "dtype": ("float32", "bfloat16", "float16"),
+        "threads": (1, 2),
+    },
+}
+NAMES = (who.OURS, who.REFERENCE, who.HAND, who.COMPILED_ANY)
+HOLDING = (who.HAND, who.COMPILED_ANY)  # they hold the values of every view
+LARGEST = 600e6  # bytes of these that are affordable several times over
+MEMORY_AXES = ("voxels", "V", "C")
+
+
+def point(label: str, problem: Problem, axis: str, value: Any, settings: Settings) -> list[dict[str, Any]]:
+    """Times of one point, and its peak memory on the axes along which memory grows."""
+    names = settings.names(*NAMES)
+    width = torch.finfo(problem.torch_dtype).bits // 8
+    held = width * problem.B * problem.V * problem.C * problem.sites
+    left_out = {}
+    if held > LARGEST:
+        reason = f"the values of all views take {held / 1e9:.1f} GB, several times over"
+        left_out = {name: reason for name in names if name in HOLDING}
+    threads = torch.get_num_threads()
+    if axis == "threads":
+        torch.set_num_threads(value)
+        # A graph is compiled for a number of threads.
+        left_out[who.COMPILED_ANY] = "compiled for one number of threads"
+    names = [name for name in names if name not in left_out]
+    try:
+        cases = timings(f"{label}, {axis} = {value}", problem, names, repeats=settings.repeats, budget=2.5)
+    finally:
+        torch.set_num_threads(threads)
+    for case in cases:
+        case.update(operator=label, axis=axis, value=value, left_out={**case["left_out"], **left_out})
+    if axis in MEMORY_AXES:
+        measured = [name for name in names if name != who.COMPILED_ANY]  # each process would compile anew
+        cases[-1]["memory"] = {name: memory.measure(problem, name, "forward+backward", threads) for name in measured}
+    return cases
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    settings = parse(__doc__, argv)
+    timing.FEWEST = 3
+    cases = []
+    for label, base in BASES.items():
+        axes = {axis: AXES[label][axis][:2] for axis in ("voxels", "dtype")} if settings.quick else AXES[label]
+        for axis, values in axes.items():
+            for value in values:
+                problem = settings.sized(base)
+                if axis == "dtype" or (axis != "threads" and not settings.quick):
+                    problem = problem.but(**{axis: value})
+                cases += point(label, problem, axis, value, settings)
+    report.show(report.time_rows(cases), "milliseconds")
+    report.show(report.memory_rows([case for case in cases if "memory" in case]), "peak memory, forward+backward")
+    report.show(report.left_out_rows([case for case in cases if case["kind"] == "forward"]), "left out")
+    settings.save("growth", cases)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,177 @@
+"""What is timed: a problem is a handful of numbers, from which every process makes the same tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lsmgeo import FrustumGrid, VoxelGrid, cameras, depth_planes
+
+__all__ = ["LAYOUTS", "LeftOut", "Problem", "Run", "Scene"]
+
+# From a source, a leaf or not, to what is compared: an output, and who sees what or None.
+Run = Callable[[Tensor], tuple[Tensor, Tensor | None]]
+
+IMAGE = 224  # pixels of the photographs; feature maps and swept maps are smaller
+LAYOUTS = ("channels_last", "contiguous")
+EXTENT = (1.0, 3.0)  # depths of the planes, the cameras being 2 from a cube of side 1
+
+
+class LeftOut(Exception):
+    """A contender that does not run a problem; the text is the reason, for the table."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Sizes and options.
+
+    Args:
+        operator: "unproject" (images to voxels), "sweep" (voxels to images), "reduce" (a sweep and a linear map of its
+            stacked channels) or "frustum" (images to the frustum of the first view).
+        B: scenes.
+        V: views of a scene.
+        C: channels.
+        size: side of the feature maps; of the maps for a sweep.
+        voxels: side of the grid.
+        planes: of a sweep or frustum.
+        mode: "smooth" or "nearest".
+        statistic: over the views; "" keeps them. "dot": the product with the first view, averaged over channels.
+        flatten: whether a sweep stacks its planes into the channels.
+        outputs: channels of the linear map.
+        dtype: of the source.
+        layout: of the source in memory.
+        device: "cpu" or "cuda".
+    """
+
+    operator: str
+    B: int = 4
+    V: int = 4
+    C: int = 32
+    size: int = 112
+    voxels: int = 32
+    planes: int = 64
+    mode: str = "smooth"
+    statistic: str = ""
+    flatten: bool = False
+    outputs: int = 512
+    dtype: str = "float32"
+    layout: str = "channels_last"
+    device: str = "cpu"
+
+    def but(self, **changes: Any) -> Problem:
+        return replace(self, **changes)
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @property
+    def is_sweep(self) -> bool:
+        return self.operator in ("sweep", "reduce")
+
+    @property
+    def torch_dtype(self) -> torch.dtype:
+        return getattr(torch, self.dtype)
+
+    @property
+    def sites(self) -> int:
+        """Sites of a view."""
+        return self.voxels**3 if self.operator == "unproject" else self.planes * self.frustum_size**2
+
+    @property
+    def frustum_size(self) -> int:
+        """Side of a frustum's images: half of the features', so that other views see it whole; all of a sweep's."""
+        return self.size // 2 if self.operator == "frustum" else self.size
+
+    @property
+    def result_bytes(self) -> int:
+        """Bytes of the output proper, without visibility."""
+        width = torch.finfo(self.torch_dtype).bits // 8
+        if self.operator == "reduce":
+            return width * self.B * self.V * self.outputs * self.size**2
+        if self.statistic == "dot":
+            return width * self.B * (self.V - 1) * self.sites
+        return width * self.B * (1 if self.statistic else self.V) * self.C * self.sites
+
+
+def channels_last(tensor: Tensor, axis: int) -> Tensor:
+    """The same values with an axis innermost in memory."""
+    return tensor.movedim(axis, -1).contiguous().movedim(-1, axis)
+
+
+def _random(shape: tuple[int, ...], seed: int) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+class Scene:
+    """The tensors of a problem."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+
+    @cached_property
+    def cameras(self) -> cameras.CameraTensors:
+        """Around the cube; close together for a frustum, so that every view sees all of it."""
+        problem = self.problem
+        shape = (problem.B, problem.V)
+        generator = torch.Generator().manual_seed(0)
+        azimuth, elevation = (torch.rand(shape, generator=generator) for _ in range(2))
+        if problem.operator == "frustum":
+            azimuth, elevation = 8.0 * azimuth, 8.0 * elevation
+        else:
+            azimuth, elevation = 360.0 * azimuth, 50.0 * elevation - 20.0
+        made = cameras.orbit(azimuth, elevation, 2.0, focal_length=420.0, height=IMAGE, width=IMAGE)
+        return cameras.to(made, problem.device)
+
+    @cached_property
+    def source(self) -> Tensor:
+        """Features (B, V, C, size, size), or a volume (B, C, voxels, voxels, voxels)."""
+        problem = self.problem
+        if problem.is_sweep:
+            made = _random((problem.B, problem.C, *(problem.voxels,) * 3), 1)
+        else:
+            made = _random((problem.B, problem.V, problem.C, problem.size, problem.size), 1)
+        if problem.layout == "channels_last":
+            made = channels_last(made, 1 if problem.is_sweep else 2)
+        return made.to(problem.device, problem.torch_dtype)
+
+    @cached_property
+    def grid(self) -> VoxelGrid | FrustumGrid:
+        problem = self.problem
+        if problem.operator != "frustum":
+            return VoxelGrid(problem.voxels)
+        side = problem.frustum_size
+        return FrustumGrid(self.frustum_camera, self.depths, size=(side, side))
+
+    @cached_property
+    def frustum_camera(self) -> cameras.CameraTensors:
+        """The central half of the first view: its pixels are those of the feature map, moved by `frustum_offset`."""
+        quarter = IMAGE // 4
+        return cameras.crop(cameras.select(self.cameras, 1, 0), quarter, quarter, IMAGE // 2, IMAGE // 2)
+
+    @property
+    def frustum_offset(self) -> int:
+        return self.problem.size // 4
+
+    @cached_property
+    def depths(self) -> Tensor:
+        problem = self.problem
+        near, far = (1.75, 2.25) if problem.operator == "frustum" else EXTENT
+        spacing = "inverse" if problem.operator == "frustum" else "depth"
+        return depth_planes(near, far, problem.planes, spacing=spacing).to(problem.device)
+
+    @cached_property
+    def weight(self) -> Tensor:
+        """Of the linear map, (outputs, C * planes)."""
+        problem = self.problem
+        inputs = problem.C * problem.planes
+        return (_random((problem.outputs, inputs), 3) * inputs**-0.5).to(problem.device, problem.torch_dtype)
+
+    def cotangent(self, output: Tensor) -> Tensor:
+        """One gradient for all, in the memory layout of each contender's own output."""
+        values = _random(tuple(output.shape), 2).to(output.dtype)
+        return torch.empty_like(output).copy_(values)

@@ -1,0 +1,91 @@
+"""Ratios against goals, as text: for the terminal and, from the JSON, for the documentation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+Rows = list[list[str]]
+
+
+def median(case: Mapping[str, Any], name: str) -> float | None:
+    """Milliseconds of a contender, or None if it did not run."""
+    timed = case["times"].get(name)
+    return None if timed is None else timed["median_ms"]
+
+
+def milliseconds(timed: Mapping[str, Any] | None) -> str:
+    """Median and half the distance of the quartiles."""
+    if timed is None:
+        return "—"
+    low, high = timed["quartiles_ms"]
+    middle = timed["median_ms"]
+    digits = 0 if middle >= 100 else 1 if middle >= 10 else 2
+    return f"{middle:.{digits}f} ± {(high - low) / 2:.{digits}f}"
+
+
+def verdict(goal: Mapping[str, Any]) -> list[str]:
+    """Ratio, target, and whether it is met."""
+    if goal["ratio"] is None:
+        return ["—", goal["target_text"], f"not measured: {goal['reason']}"]
+    return [f"{goal['ratio']:.2f}", goal["target_text"], "met" if goal["met"] else "**missed**"]
+
+
+def goal(what: str, ratio: float | None, target: float, at_least: bool, reason: str = "") -> dict[str, Any]:
+    """One line of the table of goals."""
+    met = None if ratio is None else ratio >= target if at_least else ratio <= target
+    return {
+        "goal": what,
+        "ratio": ratio,
+        "target": target,
+        "target_text": f"{'at least' if at_least else 'at most'} {target:g}",
+        "met": met,
+        "reason": reason,
+    }
+
+
+def goal_rows(cases: Sequence[Mapping[str, Any]]) -> Rows:
+    """Work, comparison, ratio, target, verdict."""
+    rows = [["work", "compared", "ratio", "target", ""]]
+    for case in cases:
+        rows += [[case["case"], found["goal"], *verdict(found)] for found in case.get("goals", [])]
+    return rows
+
+
+def time_rows(cases: Sequence[Mapping[str, Any]]) -> Rows:
+    """One row a case, one column a contender that ran in any."""
+    names = list(dict.fromkeys(name for case in cases for name in case["times"]))
+    return [["work", *names], *([case["case"], *(milliseconds(case["times"].get(n)) for n in names)] for case in cases)]
+
+
+def memory_rows(cases: Sequence[Mapping[str, Any]]) -> Rows:
+    """Megabytes above inputs, outputs and gradients, and as a multiple of the output."""
+    rows = [["work", "who", "inputs, MB", "output and gradients, MB", "above these, MB", "of the output"]]
+    for case in cases:
+        for name, taken in case["memory"].items():
+            if "left_out" in taken:
+                rows.append([case["case"], name, "—", "—", "—", taken["left_out"]])
+                continue
+            kept = taken["output"] + taken["visible"] + taken["gradients"]
+            sizes = [f"{count / 1e6:.1f}" for count in (taken["inputs"], kept, taken["above"])]
+            rows.append([case["case"], name, *sizes, f"{taken['above'] / taken['output']:.2f}"])
+    return rows
+
+
+def left_out_rows(cases: Sequence[Mapping[str, Any]]) -> Rows:
+    """Who did not take part, and why."""
+    rows = [["who", "work", "reason"]]
+    for case in cases:
+        rows += [[name, case["case"], reason] for name, reason in case.get("left_out", {}).items()]
+    return rows
+
+
+def show(rows: Rows, title: str = "") -> None:
+    """Print rows as columns."""
+    if len(rows) < 2:
+        return
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    if title:
+        print(f"\n{title}")
+    for row in rows:
+        print("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip(), flush=True)

@@ -1,7 +1,8 @@
 """The operators on a GPU: ``python -m benchmarks.gpu``.
 
-Times are those of CUDA events; the latency of a call stands apart. Goals: at least 4 times as fast as hand-written PyTorch, never slower than the compiled gather, and a share of the
-bandwidth of a copy, counting source and output once each.
+Times are those of CUDA events; the latency of a call stands apart. Goals: at least 4 times as fast as hand-written
+PyTorch, never slower than the compiled gather, and a share of the bandwidth of a copy, counting source and output once
+each.
 """
 
 from __future__ import annotations

@@ -80,6 +80,28 @@ def left_out_rows(cases: Sequence[Mapping[str, Any]]) -> Rows:
     return rows
 
 
+def first_call_rows(cases: Sequence[Mapping[str, Any]]) -> Rows:
+    """Seconds of the first calls of what is compiled, once a process and kind of call."""
+    rows = [["work", "who", "first call forward and backward, s"]]
+    seen = set()
+    for case in cases:
+        for name, seconds in case.get("first_call_s", {}).items():
+            work = case["case"].rsplit(", ", 1)[0]
+            if name.startswith("compiled") and (work, name) not in seen:
+                seen.add((work, name))
+                rows.append([work, name, f"{seconds:.1f}"])
+    return rows
+
+
+def machine_line(machine: Mapping[str, Any]) -> str:
+    """Where and when, in a sentence."""
+    return (
+        f"{machine['device']}, {machine['cores']} cores, {machine['threads']} threads, {machine['system']}, huge pages "
+        f"on {machine['huge_pages']}; lsmgeo {machine['lsmgeo']}, PyTorch {machine['torch']}, kornia "
+        f"{machine['kornia']}, Python {machine['python']}; {machine['date']}; load before: {machine['load_before']:.1f}"
+    )
+
+
 def show(rows: Rows, title: str = "") -> None:
     """Print rows as columns."""
     if len(rows) < 2:

@@ -1,0 +1,77 @@
+"""The directive ``benchmark``: a table made from a file in benchmarks/results, or a line that says there is none."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from docutils.parsers.rst import directives
+from docutils.statemachine import StringList
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+sys.path.insert(0, str(ROOT))
+
+from benchmarks import report  # noqa: E402
+
+TABLES: dict[str, Callable[[list[dict[str, Any]]], report.Rows]] = {
+    "goals": report.goal_rows,
+    "times": lambda cases: report.time_rows([case for case in cases if case.get("times")]),
+    "memory": lambda cases: report.memory_rows([case for case in cases if "memory" in case]),
+    "compiling": report.first_call_rows,
+    "left-out": report.left_out_rows,
+}
+
+
+def load(name: str) -> dict[str, Any] | None:
+    """The results of one benchmark, None if it never ran."""
+    path = RESULTS / f"{name}.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+
+def list_table(rows: report.Rows) -> list[str]:
+    """The rows as reStructuredText; the first is the header."""
+    lines = [".. list-table::", "   :header-rows: 1", "   :class: benchmark", ""]
+    for row in rows:
+        lines += [f"   {'*' if column == 0 else ' '} - {cell}".rstrip() for column, cell in enumerate(row)]
+    return [*lines, ""]
+
+
+class Benchmark(SphinxDirective):
+    """``.. benchmark:: operators_channels_last goals``."""
+
+    required_arguments = 2
+
+    def run(self) -> list[nodes.Node]:
+        name = self.arguments[0]
+        kind = directives.choice(self.arguments[1], (*TABLES, "machine"))
+        found = load(name)
+        self.env.note_dependency(str(RESULTS / f"{name}.json"))
+        if found is None:
+            lines = [f"*Not measured yet: there is no* ``benchmarks/results/{name}.json``."]
+        elif kind == "machine":
+            lines = [report.machine_line(found["machine"])]
+        else:
+            rows = TABLES[kind](found["cases"])
+            lines = list_table(rows) if len(rows) > 1 else ["None."]
+        return self.parse_text_to_nodes(StringList(lines, source=f"{name}.json"))
+
+
+def forget_plots(app: Sphinx) -> None:
+    """Remove plots that are older than their results: the plot directive looks at the age of the script alone."""
+    results = RESULTS / "growth.json"
+    for plot in (Path(app.doctreedir).parent / "plot_directive").rglob("benchmark_growth*"):
+        if results.is_file() and plot.stat().st_mtime < results.stat().st_mtime:
+            plot.unlink()
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    app.add_directive("benchmark", Benchmark)
+    app.connect("builder-inited", forget_plots)
+    return {"version": "1", "parallel_read_safe": True}

@@ -9,15 +9,24 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
-from collections.abc import Sequence
-from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from lsmgeo._dtypes import saturating_cast
-from lsmgeo.kernels.gpu_tables import Tables, lattice_gradients, tables
+from lsmgeo.kernels.gpu_launch import (
+    Accumulator,
+    Call,
+    accumulator,
+    channels_last,
+    empty_channels_last,
+    launch,
+    plan,
+    room_for_sums,
+    strided,
+)
+from lsmgeo.kernels.gpu_tables import lattice_gradients, tables
 from lsmgeo.kernels.request import Options, Sites
 
 __all__ = [
@@ -29,11 +38,6 @@ __all__ = [
     "volume_backward",
     "why_not",
 ]
-
-TILE = 2048  # elements: 16 for each thread of four warps
-SITES = (16, 256)  # of a tile
-CHANNELS = (4, 64)
-PLANES = 32  # 128 bytes of float32
 
 
 def why_not(operator: str, source: Tensor, options: Options) -> str | None:
@@ -49,202 +53,6 @@ def why_not(operator: str, source: Tensor, options: Options) -> str | None:
 
 def _is_interpreted() -> bool:
     return os.environ.get("TRITON_INTERPRET", "").lower() in ("1", "true", "on", "yes", "y")
-
-
-def _kernels() -> tuple[ModuleType, ModuleType]:
-    from lsmgeo.kernels import gpu_gradients, gpu_kernels
-
-    return gpu_kernels, gpu_gradients
-
-
-# What a launch is made of
-
-
-class _Call(NamedTuple):
-    """What both kernels are launched with."""
-
-    lattice: Any
-    points: Any
-    sizes: Any
-    how: Any
-    near: float
-    programs: int
-    views: int  # B V
-
-
-def _call(
-    source: Tensor,
-    target: Tensor,
-    options: Options,
-    extras: int,
-    lattice: Tables | None = None,
-    points: Sequence[Tensor | None] = (None, None, None),
-    volume: bool = False,
-    needs: tuple[bool, bool] = (False, False),
-) -> _Call:
-    """Plan a launch.
-
-    Args:
-        source: (B, V, C, d, h, w).
-        target: values or their gradient: (B, V, C', D, H, W), or (B, 1, C'', D, H, W).
-        options: of the call.
-        extras: number of geometric channels.
-        lattice: tables of the sites, or
-        points: pixels, front and given channels.
-        volume: whether the sites are those of frustums.
-        needs: whether the source's gradient is needed, and that of the geometry.
-    """
-    kernels, _ = _kernels()
-    views, channels = source.shape[1:3]
-    planes, height, width = target.shape[3:]
-    columns = _within(_power_of_two(channels), CHANNELS)
-    block = _within(TILE // columns, SITES)
-    # Small planes share a program. Where the third axis is the fastest in memory, a store along it is one transaction.
-    run = max(1, block // _power_of_two(height * width))
-    if 0 < target.stride(3) < max(target.stride(4), target.stride(5)):
-        run = max(run, PLANES)
-    run = min(run, _power_of_two(planes))
-    block = max(run, block)
-    tiles, slabs = max(1, -(-channels // columns)), -(-planes // run)
-    blocks = -(-height * width // (block // run))
-    blocks_of = {name: place for place, name in enumerate(options.reduce)}
-    how = kernels.How(
-        kind=2 if lattice is None else int(volume),
-        nearest=options.mode == "nearest",
-        border=options.padding_mode == "border",
-        projective=lattice is not None and lattice.projective,
-        depth=options.depth,
-        direction=bool(options.direction),
-        extras=extras,
-        reduce=bool(options.reduce),
-        mean=blocks_of.get("mean", -1),
-        variance=blocks_of.get("variance", -1),
-        maximum=blocks_of.get("max", -1),
-        largest=torch.finfo(target.dtype).max,
-        sites=block,
-        planes=run,
-        channels=columns,
-        width=_power_of_two(extras),
-        corners=1 if options.mode == "nearest" else 8 if volume else 4,
-        needs_source=needs[0],
-        needs_geometry=needs[1],
-    )
-    cells = source.shape[3:]
-    return _Call(
-        kernels.Lattice(*(None,) * 5) if lattice is None else kernels.Lattice(*lattice[:5]),
-        kernels.Points(*points),
-        kernels.Sizes(views, channels, planes, height, width, *cells, tiles, blocks, slabs),
-        how,
-        min(float(options.near), torch.finfo(torch.float32).max),
-        tiles * blocks * slabs * source.shape[0] * (1 if options.reduce else views),
-        source.shape[0] * views,
-    )
-
-
-def _launch(kernel: Any, call: _Call, *arrays: Any) -> None:
-    """Run a kernel on the arrays' device, unless it has nothing to do."""
-    if call.programs:
-        with torch.cuda.device_of(arrays[0].pointer):
-            warps = 8 if call.how.reduce else 4  # statistics need more registers
-            # Fused multiply-adds are Triton's default, which is to change.
-            kernel[(call.programs,)](
-                *arrays,
-                call.lattice,
-                call.points,
-                call.sizes,
-                call.near,
-                call.how,
-                num_warps=warps,
-                enable_fp_fusion=True,
-            )
-
-
-def _strided(array: Tensor) -> Any:
-    """A (B, V, C, z, y, x) array for a kernel."""
-    return _kernels()[0].Strided(array, *array.stride())
-
-
-def _power_of_two(count: int) -> int:
-    """The power of two at or above."""
-    return 1 << max(0, count - 1).bit_length()
-
-
-def _within(value: int, bounds: tuple[int, int]) -> int:
-    return min(max(value, bounds[0]), bounds[1])
-
-
-def _channels_last(source: Tensor, reads: int) -> Tensor:
-    """The (B, V, C, d, h, w) source with its channels side by side, which is how the kernels read them.
-
-    A copy, of what is not repeated by strides of 0, unless few of its cells are read.
-    """
-    cells = math.prod(source.shape[3:])
-    if source.shape[2] == 1 or source.stride(2) == 1 or reads < cells or source.numel() == 0:
-        return source
-    once = source[tuple(slice(0, 1) if stride == 0 else slice(None) for stride in source.stride())]
-    return once.movedim(2, -1).contiguous().movedim(-1, 2).expand_as(source)
-
-
-def _empty_last(B: int, V: int, C: int, *sites: int, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-    """An uninitialised (B, V, C, D, H, W) array, channels last in memory."""
-    return torch.empty((B, V, *sites, C), dtype=dtype or like.dtype, device=like.device).movedim(-1, 2)
-
-
-# Gradients to the source
-
-
-class _Into(NamedTuple):
-    """Where the kernel adds the source's gradient."""
-
-    array: Tensor  # (B, V or 1, C, d, h, w)
-    scale: Tensor | None = None  # (1,) float32, of fixed-point numbers
-
-    def total(self) -> Tensor:
-        return self.array if self.scale is None else (self.array.double() / self.scale.double()).float()
-
-
-def _into(
-    gradient: Tensor, source: Tensor, options: Options, sites: int, shared: bool, given: Tensor | None = None
-) -> _Into:
-    """What to add to: float32, or, where results must not depend on the order of the sums, fixed-point numbers.
-
-    Args:
-        gradient: the incoming gradient.
-        source: (B, V, C, d, h, w).
-        options: of the call.
-        sites: how many sites may add to one cell.
-        shared: whether the views add to the same cells.
-        given: float32 numbers to add to, (B, 1, C, d, h, w); otherwise to zeros.
-    """
-    fixed = torch.are_deterministic_algorithms_enabled() and gradient.numel() > 0
-    if given is not None and not fixed:
-        return _Into(given)
-    B, V, C, *cells = source.shape
-    array = _empty_last(B, 1 if shared else V, C, *cells, like=source, dtype=torch.int64 if fixed else torch.float32)
-    array.zero_()
-    if not fixed:
-        return _Into(array)
-    bound = torch.linalg.vector_norm(gradient, math.inf, dtype=torch.float32).double() * max(1, len(options.reduce))
-    if "variance" in options.reduce and source.numel():
-        largest = source.float().nan_to_num(0.0, 0.0, 0.0).abs().amax().double()
-        bound = bound * (1.0 + 8.0 * largest)
-    exponent = 62.0 - math.ceil(math.log2(max(1, sites))) - torch.log2(bound).ceil()
-    # Not a number where the gradient has none: then nor has the result.
-    return _Into(array, torch.exp2(exponent.clamp(-126.0, 126.0)).float().reshape(1))
-
-
-def _sums(call: _Call, options: Options, needed: bool, like: Tensor) -> tuple[Tensor | None, Tensor | None]:
-    """Room for the sums of `lattice_gradients`, of those that the kernel writes."""
-    kernels, _ = _kernels()
-    n, index, extra = call.sizes, None, None
-    if needed and options.mode != "nearest":
-        index = like.new_empty((call.views, n.planes, n.blocks, n.tiles, kernels.INDEX_SUMS.value), dtype=torch.float32)
-    if needed and call.how.extras:
-        extra = like.new_empty((call.views, n.planes, n.blocks, kernels.EXTRA_SUMS.value), dtype=torch.float32)
-    return index, extra
-
-
-# Operators
 
 
 def _extras(options: Options) -> int:
@@ -268,9 +76,9 @@ def _forward(
     if not visible.numel():
         return visible.view(torch.bool)
     lattice = None if sites is None else tables(sites, options, planned.get("volume", False))
-    call = _call(source, out, options, extras, lattice, **planned)
-    source = _channels_last(source, math.prod(out.shape[3:]) * call.how.corners)
-    _launch(_kernels()[0].resample, call, _strided(out), visible, _strided(source))
+    call = plan(source, out, options, extras, lattice, **planned)
+    source = channels_last(source, math.prod(out.shape[3:]) * call.how.corners)
+    launch("resample", call, strided(out), visible, strided(source))
     return visible.view(torch.bool)
 
 
@@ -285,7 +93,7 @@ def images(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tens
     B, V, C = source.shape[:3]
     channels = (C + _extras(options)) * max(1, len(options.reduce))
     shape = (sites.z.shape[-1], len(sites.y), len(sites.x))
-    out = _empty_last(B, 1 if options.reduce else V, channels, *shape, like=source)
+    out = empty_channels_last(B, 1 if options.reduce else V, channels, *shape, like=source)
     visible = _forward(source.unsqueeze(3), out, options, _extras(options), sites)
     return _joined(out, options), visible
 
@@ -323,11 +131,11 @@ def _lattice_backward(
     """Gradients to a (B, V or 1, C, d, h, w) source, in float32, and to the geometry."""
     wanted = needs[0], any(needs[1:])
     count = math.prod(gradient.shape[3:]) * (source.shape[1] if volume else 1)
-    into = _into(gradient, source, options, count, volume, given) if needs[0] else None
+    into = accumulator(gradient, source, options, count, volume, given) if needs[0] else None
     if count:
         known = tables(sites, options, volume)
-        call = _call(source, gradient, options, _extras(options), known, volume=volume, needs=wanted)
-        index_sums, extra_sums = _sums(call, options, wanted[1], source)
+        call = plan(source, gradient, options, _extras(options), known, volume=volume, needs=wanted)
+        index_sums, extra_sums = room_for_sums(call, options, wanted[1], source)
         _launch_backward(call, gradient, source, into, index_sums, extra_sums)
         found = lattice_gradients(known, options, index_sums, extra_sums) if wanted[1] else (None,) * 3
     else:
@@ -345,20 +153,20 @@ def _lattice_backward(
 
 
 def _launch_backward(
-    call: _Call,
+    call: Call,
     gradient: Tensor,
     source: Tensor,
-    into: _Into | None,
+    into: Accumulator | None,
     index_sums: Tensor | None,
     extra_sums: Tensor | None,
 ) -> None:
     if into is None and index_sums is None and extra_sums is None:
         return  # the nearest cell does not depend on the geometry
     if index_sums is not None or call.how.reduce:
-        source = _channels_last(source, math.prod(gradient.shape[3:]) * call.how.corners)
+        source = channels_last(source, math.prod(gradient.shape[3:]) * call.how.corners)
     array, scale = (source, None) if into is None else (into.array.expand(source.shape), into.scale)
-    arrays = _strided(gradient), _strided(source), _strided(array), scale, index_sums, extra_sums
-    _launch(_kernels()[1].resample_backward, call, *arrays)
+    arrays = strided(gradient), strided(source), strided(array), scale, index_sums, extra_sums
+    launch("resample_backward", call, *arrays)
 
 
 @torch.no_grad()
@@ -380,7 +188,7 @@ def pixels(
     (B, V, C), N = source.shape[:3], pixels.shape[2]
     extras = 0 if extra is None else extra.shape[2]
     channels = (C + extras) * max(1, len(options.reduce))
-    out = _empty_last(B, 1 if options.reduce else V, channels, 1, 1, N, like=source)
+    out = empty_channels_last(B, 1 if options.reduce else V, channels, 1, 1, N, like=source)
     visible = _forward(source.unsqueeze(3), out, options, extras, points=_points(pixels, front, extra))
     return _joined(out[:, :, :, 0, 0], options), visible[:, :, 0, 0]
 
@@ -418,8 +226,8 @@ def pixels_backward(
     extras = 0 if extra is None else extra.shape[2]
     target, maps = _split(gradient, options)[:, :, :, None, None], source.unsqueeze(3)
     points = _points(pixels, front, extra)
-    call = _call(maps, target, options, extras, points=points, needs=(needs[0], any(needs[1:])))
-    into = _into(target, maps, options, N, False) if needs[0] else None
+    call = plan(maps, target, options, extras, points=points, needs=(needs[0], any(needs[1:])))
+    into = accumulator(target, maps, options, N, False) if needs[0] else None
     index_sums = extra_sums = None
     if any(needs[1:]) and options.mode != "nearest":
         index_sums = source.new_empty((B, V, N, call.sizes.tiles, 2), dtype=torch.float32)
@@ -452,7 +260,7 @@ def volume(source: Tensor, sites: Sites, options: Options, out: Tensor | None = 
     if out is None and getattr(options, "stacked", False):
         out = source.new_empty((B, V, h, w, channels, P)).permute(0, 1, 4, 5, 2, 3)
     elif out is None:
-        out = _empty_last(B, V, channels, P, h, w, like=source)
+        out = empty_channels_last(B, V, channels, P, h, w, like=source)
     views = _seen_by(source, V)
     return out, _forward(views, out, options, _extras(options), sites, volume=True)
 

@@ -8,18 +8,6 @@ import triton  # type: ignore[import-untyped]
 import triton.language as tl  # type: ignore[import-untyped]
 
 from lsmgeo.kernels.gpu_kernels import (
-    EXTRA_SUMS,
-    EXTRAS,
-    FEATURES,
-    FIELDS,
-    IMAGES,
-    INDEX_SUMS,
-    LARGEST,
-    LARGEST_DEVIATION,
-    OUTSIDE,
-    PIXELS,
-    UNIT,
-    VOLUME,
     _addresses,
     _cell,
     _channels,
@@ -34,6 +22,20 @@ from lsmgeo.kernels.gpu_kernels import (
     _values,
     _variance,
     _view_start,
+)
+from lsmgeo.kernels.gpu_types import (
+    EXTRA_SUMS,
+    EXTRAS,
+    FEATURES,
+    FIELDS,
+    IMAGES,
+    INDEX_SUMS,
+    LARGEST,
+    LARGEST_DEVIATION,
+    OUTSIDE,
+    PIXELS,
+    UNIT,
+    VOLUME,
 )
 
 __all__ = ["resample_backward"]
@@ -163,6 +165,12 @@ def _pull_back_view(
 
 
 @triton.jit
+def _unsaturated(g, values, HOW: tl.constexpr):
+    """Nothing comes back through what saturates in a smaller dtype."""
+    return tl.where(tl.abs(values) <= HOW.largest, g, 0.0) if HOW.largest < LARGEST else g
+
+
+@triton.jit
 def _pull_back(
     PART: tl.constexpr,
     share,
@@ -181,14 +189,13 @@ def _pull_back(
     if HOW.reduce:
         start = site.owner * gradient.b
         mean, best, first, top = _moments(PART, share, source, lattice, points, site, n, near, HOW)
-        # Nothing comes back through a statistic that saturates.
         of_mean, of_square, of_best = tl.zeros_like(mean), tl.zeros_like(mean), tl.zeros_like(mean)
         if HOW.mean >= 0:
             of_mean = _load_gradient(gradient, start, HOW.mean, PART, site, n, HOW) * share[:, None]
-            of_mean = tl.where(tl.abs(mean) <= HOW.largest, of_mean, 0.0)
+            of_mean = _unsaturated(of_mean, mean, HOW)
         if HOW.maximum >= 0:
             of_best = _load_gradient(gradient, start, HOW.maximum, PART, site, n, HOW)
-            of_best = tl.where(tl.abs(best) <= HOW.largest, of_best, 0.0)
+            of_best = _unsaturated(of_best, best, HOW)
         if HOW.variance >= 0:
             of_square = _load_gradient(gradient, start, HOW.variance, PART, site, n, HOW) * share[:, None]
             if top > HOW.largest**0.5 / 2.0:  # deviations may be held or the variance saturate: look again

@@ -13,155 +13,31 @@ Importing this module imports Triton.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import triton  # type: ignore[import-untyped]
 import triton.language as tl  # type: ignore[import-untyped]
 
-__all__ = ["EXTRA_SUMS", "INDEX_SUMS", "How", "Lattice", "Points", "Sizes", "Strided"]
+from lsmgeo.kernels.gpu_types import (
+    DIRECTION_FIELDS,
+    EXTRAS,
+    FEATURES,
+    FIELDS,
+    FOUR_EPS,
+    KEPT,
+    LARGEST,
+    LARGEST_COORDINATE,
+    LARGEST_DEVIATION,
+    OUTSIDE,
+    PIXELS,
+    SMALLEST_DEPTH,
+    TERMS,
+    UNIT,
+    VOLUME,
+    Cell,
+    Place,
+    Site,
+)
 
-# What a lane is: a site of a lattice that looks into images, or into volumes, or a given pixel of images.
-IMAGES = tl.constexpr(0)
-VOLUME = tl.constexpr(1)
-PIXELS = tl.constexpr(2)
-
-# The tile of features, and that of geometric channels.
-FEATURES = tl.constexpr(0)
-EXTRAS = tl.constexpr(1)
-
-# As in the reference.
-OUTSIDE = tl.constexpr(-2.0)
-LARGEST_COORDINATE = tl.constexpr(2.0**100)
-SMALLEST_DEPTH = tl.constexpr(2.0**-60)
-FOUR_EPS = tl.constexpr(2.0**-21)
-LARGEST = tl.constexpr((2.0 - 2.0**-23) * 2.0**127)
-LARGEST_DEVIATION = tl.constexpr(((2.0 - 2.0**-23) * 2.0**127) ** 0.5)
-
-# A view's numbers in `Lattice.views`: M by rows, the z of a site at depth 1 (or at s = 1), 1 if the view is kept; where
-# directions are asked for also G by rows, and the bound on the terms of its sums: a constant, and a factor of |z|.
-FIELDS = tl.constexpr(28)
-UNIT = tl.constexpr(12)
-KEPT = tl.constexpr(13)
-DIRECTION_FIELDS = tl.constexpr(14)
-TERMS = tl.constexpr(26)
-
-# Sums over the sites of a plane that a program writes: for each of three rows g x, g y and g. Those of geometric
-# channels start with the depth's row and what goes through s.
-INDEX_SUMS = tl.constexpr(9)
-EXTRA_SUMS = tl.constexpr(13)
-
-
-class Strided(NamedTuple):
-    """An array by its first element and its strides: scene, view, channel, and three of sites or cells."""
-
-    pointer: Any
-    b: Any
-    v: Any
-    c: Any
-    z: Any
-    y: Any
-    x: Any
-
-
-class Lattice(NamedTuple):
-    """What places the sites of a lattice: float32 tables."""
-
-    views: Any  # (B V, FIELDS)
-    x: Any  # (W,)
-    y: Any  # (H,)
-    z: Any  # (B V, D)
-    depth: Any  # (B V, D), of frustums in volumes
-
-
-class Points(NamedTuple):
-    """Sites that come with their pixels: contiguous."""
-
-    pixels: Any  # (B V, N, 2) float32
-    front: Any  # (B V, N) uint8
-    extra: Any  # (B V, E, N) float32
-
-
-class Sizes(NamedTuple):
-    """Counts of views, channels, sites and cells, and into how many programs each is divided."""
-
-    views: Any
-    channels: Any
-    planes: Any  # D or P
-    height: Any
-    width: Any  # of the lattice; the number of pixels
-    cells_z: Any
-    cells_y: Any
-    cells_x: Any
-    tiles: Any  # of channels
-    blocks: Any  # of sites in a plane
-    slabs: Any  # of planes
-
-
-class How(NamedTuple):
-    """Everything a kernel is compiled for."""
-
-    kind: int
-    nearest: bool
-    border: bool
-    projective: bool
-    depth: bool
-    direction: bool
-    extras: int  # geometric channels
-    reduce: bool
-    mean: int  # place of its block of channels; -1 if not asked for
-    variance: int
-    maximum: int
-    largest: float  # finite value of the output's dtype
-    sites: int  # of a tile
-    planes: int  # of them that follow each other along the third axis: 1 unless that is the output's fastest
-    channels: int  # of the features' tile
-    width: int  # of the tile of geometric channels
-    corners: int  # cells a sample is made of
-    needs_source: bool = False
-    needs_geometry: bool = False
-
-
-class Site(NamedTuple):
-    """The sites of a program."""
-
-    owner: Any  # b V + v, or b where views are reduced
-    tile: Any
-    slab: Any
-    block: Any
-    pixel: Any  # within the plane; (sites,) from here on
-    k: Any
-    j: Any
-    i: Any
-    keep: Any
-    x: Any
-    y: Any
-
-
-class Place(NamedTuple):
-    """Where a view sees the sites, (sites,) each."""
-
-    x: Any  # index into the source
-    y: Any
-    z: Any
-    front: Any
-    visible: Any
-    inverse: Any  # 1 / (M q)_3 of images
-    distance: Any  # the depth channel
-
-
-class Cell(NamedTuple):
-    """The lower cell, the way to the upper one, and the index's derivative: 0 where it is clamped."""
-
-    x: Any
-    y: Any
-    z: Any
-    along_x: Any
-    along_y: Any
-    along_z: Any
-    slope_x: Any
-    slope_y: Any
-    slope_z: Any
-
+__all__ = ["resample"]
 
 # Places
 

@@ -93,7 +93,8 @@ def lattice_gradients(
     if tables.depth is not None:
         depth = tables.exact
         matrix = _outer_sums(rows, depth, torch.ones_like(depth))
-        along = (rows * tables.matrix[:, :, None, :, (0, 1, 3)]).sum((-1, -2))
+        plane = torch.cat((tables.matrix[..., :2], tables.matrix[..., 3:]), -1)[:, :, None]
+        along = (rows * plane).sum((-1, -2))
         if options.depth and extra is not None:
             along = along + extra[..., 3]
         z_gradient = -along * depth.square()

@@ -7,7 +7,7 @@ import importlib.util
 import pytest
 import torch
 
-from lsmgeo.kernels import Options, Sites, gpu
+from lsmgeo.kernels import Options, Sites, gpu, gpu_launch
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
 
@@ -37,7 +37,7 @@ class Hopper:
 
 
 @pytest.fixture
-def compiled(monkeypatch, tmp_path):
+def compiled(monkeypatch, tmp_path, variant):
     """What the kernels were compiled to instead of being launched."""
     import triton
     from triton.backends.nvidia.compiler import get_ptxas
@@ -53,6 +53,8 @@ def compiled(monkeypatch, tmp_path):
     def compile_only(self, *args, grid, warmup, **kwargs):
         found.append(run(self, *args, grid=grid, warmup=True, **kwargs))
 
+    if variant in VARIANTS:
+        monkeypatch.setattr(gpu_launch, "TILE", 512)  # a quarter of the code
     before = triton.runtime.driver._active
     monkeypatch.setattr(JITFunction, "run", compile_only)
     triton.runtime.driver.set_active(Hopper())
@@ -91,7 +93,17 @@ def fixed_point(dtype, options):
         torch.use_deterministic_algorithms(False)
 
 
+def one_of_everything(dtype, options):
+    """Sizes of 1, which Triton takes for constants."""
+    one = torch.ones(1, dtype=torch.float64)
+    single = Sites(torch.ones(1, 1, 3, 4, dtype=torch.float64), None, one, one, one, False, None)
+    source = torch.zeros(1, 1, 1, 1, 1, dtype=dtype)
+    values, _ = gpu.images(source, single, options)
+    gpu.images_backward(values, source, single, options, (True,) * 4)
+
+
 VARIANTS = {
+    "sizes of 1": (one_of_everything, torch.float32, Options("bilinear", reduce=("max",))),
     "images": (images, torch.float32, Options("bilinear", **AUGMENTED)),
     "frustums, nearest": (lambda *args: images(*args, True), torch.float16, Options("nearest", depth=True)),
     "variance": (images, torch.bfloat16, Options("bilinear", "border", reduce=("variance",))),
@@ -99,6 +111,8 @@ VARIANTS = {
     "pixels": (pixels, torch.float32, Options("bilinear")),
 }
 MORE = {
+    "images, full tile": VARIANTS["images"],
+    "volume, full tile": VARIANTS["volume"],
     "mean": (images, torch.float32, Options("bilinear", reduce=("mean",))),
     "maximum": (images, torch.float32, Options("nearest", reduce=("max",))),
     "everything": (images, torch.float32, Options("bilinear", reduce=EVERY, **AUGMENTED)),

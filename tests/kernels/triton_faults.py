@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import torch
 
-from lsmgeo.kernels import gpu, gpu_tables
+from lsmgeo.kernels import gpu, gpu_launch, gpu_tables
 from lsmgeo.kernels.request import Options
 from tests.kernels.triton_support import compare, features, image_sites, sweep_sites, volumes
 
@@ -46,7 +46,7 @@ def _statistics() -> None:
 
 
 def _ties() -> None:
-    sites = image_sites(24, batch=1, views=2)
+    sites = image_sites(27, batch=1, views=2)
     sites = sites._replace(matrix=sites.matrix[:, :1].expand(1, 2, 3, 4))
     compare(features(2, batch=1, views=1).expand(1, 2, 2, 5, 7), sites, Options("bilinear", reduce=("max",)))
 
@@ -147,15 +147,16 @@ def broken(fault: Fault | None) -> Iterator[None]:
         texts[fault.file] = texts[fault.file].replace(fault.text, fault.instead)
     names = {name: f"{name}_{next(COUNT)}" for name in texts}
     texts[GRADIENTS] = texts[GRADIENTS].replace(f"lsmgeo.kernels.{KERNELS}", names[KERNELS])
-    before = {name: getattr(gpu, name) for name in ("_kernels", "tables", "lattice_gradients")}
+    before = gpu_launch.kernels, gpu.tables, gpu.lattice_gradients
     with tempfile.TemporaryDirectory() as folder:
         kernels, gradients, tables = (_load(names[name], texts[name], Path(folder)) for name in texts)
-        gpu._kernels = lambda: (kernels, gradients)
+        found = {"resample": kernels.resample, "resample_backward": gradients.resample_backward}
+        gpu_launch.kernels = lambda: found
         gpu.tables, gpu.lattice_gradients = tables.tables, tables.lattice_gradients
         try:
             yield
         finally:
-            vars(gpu).update(before)
+            gpu_launch.kernels, gpu.tables, gpu.lattice_gradients = before
             for name in names.values():
                 sys.modules.pop(name)
 

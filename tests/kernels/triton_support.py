@@ -18,7 +18,7 @@ from lsmgeo.kernels.request import Options, Sites
 from lsmgeo.kernels.statistics import view_statistics
 from tests import tolerances
 
-B, V = 2, 3
+B, V = 1, 3  # scenes and views where a case says nothing else
 SHAPE = (2, 3, 4)  # D, H, W
 IMAGE = (5, 7)
 CELLS = (4, 5, 6)

@@ -19,6 +19,8 @@ from typing import NamedTuple
 
 import torch
 
+from lsmgeo.kernels import Options, gpu
+
 
 class Outcome(NamedTuple):
     wrong: str
@@ -77,12 +79,14 @@ def outcomes(table: str, *names: str, timeout: float = 280.0) -> dict[str, Outco
 
 def main() -> None:
     torch.set_num_threads(1)
-    patch_once()
     table, *names = sys.argv[1:] or ["cases"]
     if table == "cases":
         from tests.kernels.triton_cases import CASES as chosen
     else:
         from tests.kernels.triton_faults import FAULTS as chosen
+    assert gpu.why_not("unproject", torch.zeros(1, 1, 1, 2, 2), Options("bilinear")) is None
+    assert "triton" not in sys.modules, "Triton is imported before the first launch"
+    patch_once()
     run(chosen, names or chosen)
 
 

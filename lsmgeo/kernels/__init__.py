@@ -82,8 +82,10 @@ def explain(operator: str, source: Tensor, **options: Any) -> str:
     Example:
         >>> import torch
         >>> from lsmgeo import kernels
-        >>> _ = kernels.explain("unproject", torch.zeros(1, 2, 8, 16, 16))
-        unproject of (1, 2, 8, 16, 16) float32 on cpu
+        >>> _ = kernels.explain("unproject", torch.zeros(1, 2, 8, 16, 16, dtype=torch.float64))
+        unproject of (1, 2, 8, 16, 16) float64 on cpu
+          cpu: float64 stays on the reference path
+          triton: float64 stays on the reference path
           reference: taken
     """
     check_choice("explain", "operator", operator, OPERATORS)

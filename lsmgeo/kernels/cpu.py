@@ -1,7 +1,7 @@
 """The C++ kernels: loading the library, and calls on tensors without derivatives.
 
-The library is a part of the package that a build without a compiler leaves out; `why_not` says so then. It knows nothing
-of Python or PyTorch: tensors are handed over as addresses and strides, threads are those of PyTorch's own pool.
+The library is a part of the package that a build without a compiler leaves out; `why_not` says so then. It knows
+nothing of Python or PyTorch: tensors are handed over as addresses and strides, threads are those of PyTorch's own pool.
 """
 
 from __future__ import annotations
@@ -107,12 +107,22 @@ def load(path: Path) -> ctypes.CDLL | str:
 
 def why_not(operator: str, source: Tensor, options: Options) -> str | None:
     """Why the C++ kernels cannot run a call, or None."""
-    if source.device.type != "cpu":
-        return f"runs on the CPU, the source is on {source.device.type}"
     if source.dtype not in TYPES:
-        return f"computes in float32, the source is {str(source.dtype).removeprefix('torch.')}"
+        return "float64 stays on the reference path"
+    if source.device.type != "cpu":
+        return f"its kernels are for CPU tensors, these are on {source.device.type}"
+    return _missing()
+
+
+def _missing() -> str | None:
+    """Why there is no library, or None."""
     library = _library()
     return library if isinstance(library, str) else None
+
+
+# torch.compile takes the answer as a constant instead of looking into the loading of a file. What
+# `torch.compiler.assume_constant_result` does beyond this is to import dynamo.
+_missing._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def instruction_set(name: str | None = None) -> str:
@@ -200,7 +210,7 @@ def _values(call: _Call, values: Tensor, strides: Sequence[int], visible: Tensor
 
 
 def _gradient(call: _Call, gradient: Tensor, strides: Sequence[int]) -> None:
-    """Hand over the incoming gradient, and split the channels where scenes and views alone would not feed the threads."""
+    """Hand over the incoming gradient; split the channels where scenes and views alone would not feed the threads."""
     call.gradient, call.gradient_type = gradient.data_ptr(), TYPES[gradient.dtype]
     call.gradient_stride[:] = strides
     units = max(1, call.scenes * (1 if call.kind == VOLUMES or call.statistics else call.views))
@@ -313,7 +323,7 @@ def pixels(
     N, channels = front.shape[-1], C + call.extra
     if options.reduce:
         values = fresh((B, channels * len(options.reduce), N), source.dtype, (0, 2, 1))
-        strides = (values.stride(0), 0, values.stride(1), 0, 0, values.stride(2))
+        strides: tuple[int, ...] = (values.stride(0), 0, values.stride(1), 0, 0, values.stride(2))
     else:
         values = fresh((B, V, channels, N), source.dtype, (0, 1, 3, 2))
         strides = (*values.stride()[:3], 0, 0, values.stride(3))

@@ -4,8 +4,8 @@
 channels, tile by tile. Which kernels run them, C++ or Triton, is an argument. Derivatives of derivatives are those of
 the reference.
 
-They are defined through `torch.library.Library`: `torch.library.custom_op` imports dynamo at its first call, which takes
-seconds.
+They are defined through `torch.library.Library`: `torch.library.custom_op` imports dynamo at its first call, which
+takes seconds.
 """
 
 from __future__ import annotations
@@ -37,11 +37,15 @@ def why_not(name: str, operator: str, source: Tensor, options: Options) -> str |
     """Why the kernels of this name cannot run a call, or None."""
     if torch.compiler.is_exporting():
         return "torch.export takes the reference, whose operations every runtime knows"
-    if not torch.compiler.is_compiling() and (
-        torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0 or torch.jit.is_tracing()
-    ):
+    if not torch.compiler.is_compiling() and _is_transformed():
         return "torch.func, forward-mode derivatives and torch.jit take the reference"
     return KERNELS[name].why_not(operator, source, options)
+
+
+def _is_transformed() -> bool:
+    """Whether something other than autograd's backward or torch.compile looks into the operations."""
+    transforms: bool = torch._C._are_functorch_transforms_active()
+    return transforms or forward_ad._current_level >= 0 or torch._C._get_tracing_state() is not None
 
 
 # Schemas
@@ -278,19 +282,19 @@ def _part(sites: Sites, b: int, v: int, rows: slice) -> Sites:
 
 def _unstacked(tile: Tensor, planes: int, channels: int, width: int) -> Tensor:
     """A tile (rows * width, planes * channels) as (1, 1, C', P, rows, width), without a copy."""
-    return tile.view(-1, width, planes, channels).permute(3, 2, 0, 1)[None, None]
+    rows = tile.shape[0] // max(1, width)
+    return tile.view(rows, width, planes, channels).permute(3, 2, 0, 1)[None, None]
 
 
 def _project_reduce(kernels: Any, given: dict[str, Any], options: Options) -> tuple[Tensor, Tensor]:
     source, sites, weight, bias = _neighbours(given["source"]), _sites(given), given["weight"], given["bias"]
     maps, visible = _shapes("project_reduce", given)
-    if kernels is cpu and maps.numel():
-        B, V, O, h, w = maps.shape
+    if kernels is cpu:
         maps = cpu.fresh(maps.shape, source.dtype, (0, 1, 3, 4, 2))
-    O, channels, planes = weight.shape
+    outputs, channels, planes = weight.shape
     width = maps.shape[4]
-    kernel = weight.permute(2, 1, 0).reshape(planes * channels, O).float()
-    offset = weight.new_zeros(O, dtype=torch.float32) if bias is None else bias.float()
+    kernel = weight.permute(2, 1, 0).reshape(planes * channels, outputs).float()
+    offset = weight.new_zeros(outputs, dtype=torch.float32) if bias is None else bias.float()
     memory = None
     options = replace(options, stacked=False)
     with torch.autocast(source.device.type, enabled=False):
@@ -303,7 +307,7 @@ def _project_reduce(kernels: Any, given: dict[str, Any], options: Options) -> tu
             _, visible[b : b + 1, v : v + 1, :, rows] = kernels.volume(
                 source[b : b + 1], _part(sites, b, v, rows), options, swept
             )
-            target = maps[b, v, :, rows].permute(1, 2, 0).view(pixels, O)
+            target = maps[b, v, :, rows].permute(1, 2, 0).view(pixels, outputs)
             if target.dtype == torch.float32:
                 torch.addmm(offset, tile, kernel, out=target)
             else:
@@ -316,9 +320,9 @@ def _project_reduce_backward(
 ) -> tuple[Tensor | None, ...]:
     original, sites, weight = given["source"], _sites(given), given["weight"]
     source = _neighbours(original)
-    O, channels, planes = weight.shape
+    outputs, channels, planes = weight.shape
     (B, V), width, D = sites.matrix.shape[:2], sites.x.shape[0], sites.z.shape[-1]
-    kernel = weight.permute(2, 1, 0).reshape(planes * channels, O).float()
+    kernel = weight.permute(2, 1, 0).reshape(planes * channels, outputs).float()
     options = replace(options, stacked=False)
     places, needs_weight, needs_bias = needs[:4], needs[4], needs[5]
     to_source = _channels_last(source, source.shape, 1, torch.float32).zero_() if needs[0] else None
@@ -331,7 +335,10 @@ def _project_reduce_backward(
             if memory is None:
                 memory = source.new_empty((pixels, planes * channels), dtype=torch.float32)
             tile = memory[:pixels]
-            volume, incoming = source[b : b + 1], gradient[b, v, :, rows].permute(1, 2, 0).reshape(pixels, O).float()
+            volume, incoming = (
+                source[b : b + 1],
+                gradient[b, v, :, rows].permute(1, 2, 0).reshape(pixels, outputs).float(),
+            )
             if to_kernel is not None:
                 kernels.volume(volume, part, options, _unstacked(tile, planes, channels, width))
                 to_kernel.addmm_(tile.t(), incoming)
@@ -345,7 +352,7 @@ def _project_reduce_backward(
                         total[b, v] += share[0, 0]
     to_weight = None
     if to_kernel is not None:
-        to_weight = to_kernel.view(planes, channels, O).permute(2, 1, 0).contiguous().to(weight.dtype)
+        to_weight = to_kernel.view(planes, channels, outputs).permute(2, 1, 0).contiguous().to(weight.dtype)
     to_bias = None
     if needs_bias:
         to_bias = gradient.sum((0, 1, 3, 4), dtype=torch.float32).to(given["bias"].dtype)

@@ -170,7 +170,7 @@ MISTAKES = {
     "unknown backend": (
         lambda: Unproject(backend="cuda"),
         OptionError,
-        "Unproject: backend must be one of 'auto', 'reference'; got str 'cuda'",
+        "Unproject: backend must be one of 'auto', 'cpu', 'triton', 'reference'; got str 'cuda'",
     ),
     "no grid": (
         lambda: Unproject()(FEATURES, VIEWS),

@@ -82,7 +82,8 @@ def test_every_module_has_its_place():
 def test_the_core_imports_along_the_arrows(module):
     names = imported(MODULES[module], module)
     assert violations(module, names) == set()
-    assert {name.split(".")[0] for name in names} & HEAVY == set()
+    allowed = {"triton"} if module.startswith("lsmgeo.kernels.gpu_") else set()  # loaded with the first call
+    assert {name.split(".")[0] for name in names} & HEAVY <= allowed
 
 
 @pytest.mark.parametrize("module", MODULES)

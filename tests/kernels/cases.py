@@ -1,0 +1,108 @@
+"""A few fixed scenes for comparing a backend with the reference, small, and ugly in every way that has mattered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from lsmgeo import FrustumGrid, VoxelGrid, cameras
+from lsmgeo.cameras import CameraTensors
+from tests.kernels.comparison import Call, compare, points_call, reduce_call, sweep_call, unproject_call, views_call
+
+B, V, C = 2, 3, 5
+_generator = torch.Generator().manual_seed(3)
+
+
+def _random(*shape: int) -> torch.Tensor:
+    return torch.rand(*shape, generator=_generator) - 0.5
+
+
+def _ugly_cameras() -> CameraTensors:
+    """Skewed, rolled, of unequal focal lengths; the last view of the second scene looks the other way."""
+    azimuth = torch.tensor([[3.7, 58.1, 131.3], [11.9, 97.3, 251.7]])
+    views = cameras.orbit(azimuth, 23.0, 1.7, focal_length=21.0, height=12, width=15)
+    K, E = views.intrinsics.clone(), views.cam_from_world.clone()
+    K[..., 0, 1] = 1.3
+    K[..., 1, 1] *= 1.4
+    K[..., :2, 2] += torch.tensor([0.37, -0.81])
+    E[1, 2, :3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0])) @ E[1, 2, :3]
+    E[0, 1, :3, 3] += torch.tensor([0.1, 0.2, -1.5])  # among the voxels
+    return views._replace(intrinsics=K, cam_from_world=E)
+
+
+VIEWS = _ugly_cameras()
+POSE = torch.eye(4)
+POSE[:3] = torch.tensor([[0.9, 0.2, -0.1, 0.07], [-0.3, 1.1, 0.2, -0.05], [0.15, -0.1, 0.8, 0.03]])
+GRID = VoxelGrid((4, 3, 6), (-0.6, -0.5, -0.7), (0.5, 0.45, 0.65), POSE)
+FEATURES = _random(B, V, C, 7, 10)
+VOLUME = _random(B, C, *GRID.shape)
+POINTS = 1.3 * _random(B, 11, 3)
+PIXELS = torch.tensor([10.3, 7.4]) * (1.4 * _random(B, V, 11, 2) + 0.5) - 0.5
+DISTANCE = _random(B, V, 11) + 0.3
+VALID = _random(B, V, 11) > -0.3
+DEPTHS = torch.tensor([0.62, 1.11, 1.43, 2.07, 2.9])
+SIZE = (5, 6)
+MASK = torch.tensor([[True, True, False], [True, False, True]])
+WEIGHT, BIAS = _random(4, C * 5), _random(4)
+
+
+def frustum() -> FrustumGrid:
+    """Projective, with depths of their own for each scene."""
+    reference = CameraTensors(*(field[:, 0] for field in VIEWS))
+    return FrustumGrid(reference, torch.stack((DEPTHS, 1.1 * DEPTHS)), SIZE)
+
+
+def _both(**options: Any) -> dict[str, Any]:
+    return {"augment": ("depth", "direction"), **options}
+
+
+def _case(make: Callable[..., Call], *given: Any, flat: int | None = None, **options: Any) -> Callable[[str], None]:
+    reduced = options.get("reduce") is not None
+    return lambda backend: compare(make(*given, **options), backend, reduced, flat)
+
+
+_EVERY = ("max", "mean", "variance")
+# More channels than a vector has lanes, and a rest.
+WIDE, WIDE_VOLUME = (
+    torch.cat([(0.3 + 0.07 * number) * source for number in range(7)], axis)
+    for source, axis in ((FEATURES, 2), (VOLUME, 1))
+)
+SWEEP = (VOLUME, VIEWS, GRID, DEPTHS, SIZE)
+
+CASES: dict[str, Callable[[str], None]] = {
+    "bilinear": _case(unproject_call, FEATURES, VIEWS, GRID, **_both()),
+    "bilinear, border": _case(unproject_call, WIDE, VIEWS, GRID, padding_mode="border"),
+    "nearest": _case(unproject_call, FEATURES, VIEWS, GRID, mode="nearest", **_both(direction_frame="camera")),
+    "nearest, border, masked": _case(
+        unproject_call, FEATURES, VIEWS, GRID, mode="nearest", padding_mode="border", view_mask=MASK, **_both()
+    ),
+    "frustum, masked": _case(unproject_call, FEATURES, VIEWS, frustum(), view_mask=MASK, **_both()),
+    "near": _case(unproject_call, FEATURES, VIEWS, GRID, near=1.6, padding_mode="border"),
+    "mean": _case(unproject_call, WIDE, VIEWS, GRID, reduce="mean"),
+    "variance": _case(unproject_call, WIDE, VIEWS, GRID, reduce="variance", padding_mode="border"),
+    "statistics": _case(unproject_call, FEATURES, VIEWS, GRID, reduce=_EVERY, view_mask=MASK, **_both()),
+    "points": _case(points_call, FEATURES, VIEWS, POINTS, **_both()),
+    "points, statistics": _case(points_call, FEATURES, VIEWS, POINTS, reduce=_EVERY, **_both()),
+    "pixels": _case(views_call, WIDE, PIXELS, DISTANCE, VALID, augment="depth", padding_mode="border"),
+    "pixels, mean": _case(views_call, FEATURES, PIXELS, DISTANCE, VALID, reduce="mean"),
+    "trilinear": _case(sweep_call, *SWEEP, flatten=False, **_both()),
+    "trilinear, border, stacked": _case(
+        sweep_call, WIDE_VOLUME, *SWEEP[1:], flat=5, padding_mode="border", view_mask=MASK, **_both()
+    ),
+    "nearest sweep": _case(sweep_call, *SWEEP, flatten=False, mode="nearest", **_both(direction_frame="camera")),
+    "nearest sweep, stacked, near": _case(sweep_call, *SWEEP, flat=5, mode="nearest", near=1.2),
+    "reduced sweep": _case(reduce_call, *SWEEP, WEIGHT, BIAS),
+}
+HALF: dict[str, Callable[[str], None]] = {
+    f"{name}, {dtype}".replace("torch.", ""): case
+    for dtype in (torch.bfloat16, torch.float16)
+    for name, case in {
+        "bilinear": _case(unproject_call, WIDE.to(dtype), VIEWS, GRID, **_both()),
+        "statistics": _case(unproject_call, WIDE.to(dtype), VIEWS, GRID, reduce=("mean", "variance")),
+        "trilinear": _case(sweep_call, WIDE_VOLUME.to(dtype), *SWEEP[1:], flat=5, padding_mode="border", **_both()),
+        "pixels": _case(views_call, WIDE.to(dtype), PIXELS, DISTANCE, VALID),
+        "small numbers": _case(unproject_call, (1e-5 * WIDE).to(dtype), VIEWS, GRID, padding_mode="border"),
+    }.items()
+}

@@ -1,0 +1,192 @@
+"""A backend against the reference: values, visibility, and vector-Jacobian products with random cotangents.
+
+The measure of a backend is the reference in float64. Its error may be a few times that of the reference in float32,
+whose own errors the property suite bounds by analysis. Sites next to a kink (a cell's border, the image's border, the
+near plane) are left out of cotangents and of the comparison: there both answers are right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lsmgeo import functional, rays
+from lsmgeo.cameras import CameraTensors
+from lsmgeo.kernels import OPERATORS, reference
+from tests import tolerances
+
+GUARD = 2e-3  # in cells, to the next multiple of a half
+TIMES = 8.0  # of the error of the reference in float32
+FLOOR = 2.0**-20  # relative to the largest magnitude: what a few float32 sums of a handful of terms may lose
+
+Run = Callable[..., tuple[Tensor, Tensor]]
+
+
+class Call(NamedTuple):
+    """An operator on leaves, the tensors that a gradient is asked for; `run(*leaves, backend=...)` gives its answer."""
+
+    name: str
+    run: Run
+    leaves: tuple[Tensor, ...]
+
+
+def unproject_call(features: Tensor, cameras: CameraTensors, grid: Any, **options: Any) -> Call:
+    def run(features: Tensor, K: Tensor, E: Tensor, **backend: Any) -> Any:
+        moved = cameras._replace(intrinsics=K, cam_from_world=E)
+        return functional.unproject(features, moved, grid, **options, **backend)
+
+    return Call("unproject", run, (features, cameras.intrinsics, cameras.cam_from_world))
+
+
+def points_call(features: Tensor, cameras: CameraTensors, points: Tensor, **options: Any) -> Call:
+    def run(features: Tensor, K: Tensor, E: Tensor, points: Tensor, **backend: Any) -> Any:
+        moved = cameras._replace(intrinsics=K, cam_from_world=E)
+        return functional.unproject_points(features, moved, points, **options, **backend)
+
+    return Call("unproject_points", run, (features, cameras.intrinsics, cameras.cam_from_world, points))
+
+
+def views_call(features: Tensor, pixels: Tensor, depth: Tensor, valid: Tensor, **options: Any) -> Call:
+    def run(features: Tensor, pixels: Tensor, depth: Tensor, **backend: Any) -> Any:
+        return functional.sample_views(features, pixels, depth, valid, **options, **backend)
+
+    return Call("sample_views", run, (features, pixels, depth))
+
+
+def sweep_call(
+    volume: Tensor, cameras: CameraTensors, grid: Any, depths: Tensor, size: tuple[int, int], **options: Any
+) -> Call:
+    def run(volume: Tensor, K: Tensor, E: Tensor, depths: Tensor, **backend: Any) -> Any:
+        moved = cameras._replace(intrinsics=K, cam_from_world=E)
+        return functional.plane_sweep_project(volume, moved, grid, depths, size, **options, **backend)
+
+    return Call("plane_sweep_project", run, (volume, cameras.intrinsics, cameras.cam_from_world, depths))
+
+
+def reduce_call(
+    volume: Tensor,
+    cameras: CameraTensors,
+    grid: Any,
+    depths: Tensor,
+    size: tuple[int, int],
+    weight: Tensor,
+    bias: Tensor | None,
+    **options: Any,
+) -> Call:
+    def run(volume: Tensor, K: Tensor, E: Tensor, depths: Tensor, weight: Tensor, *bias: Tensor, **backend: Any) -> Any:
+        moved = cameras._replace(intrinsics=K, cam_from_world=E)
+        offset = bias[0] if bias else None
+        return rays.project_reduce(volume, moved, grid, depths, weight, offset, size, **options, **backend)
+
+    leaves = (volume, cameras.intrinsics, cameras.cam_from_world, depths, weight)
+    return Call("project_reduce", run, leaves if bias is None else (*leaves, bias))
+
+
+class _Kinks:
+    """Notes, while the reference runs, which samples (B, V, *sites) lie next to a kink."""
+
+    def __init__(self) -> None:
+        self.close: list[Tensor] = []
+
+    def __enter__(self) -> _Kinks:
+        self.inner = reference._sample
+
+        def watching(source: Tensor, index: Sequence[Tensor], front: Tensor, options: Any) -> Any:
+            close = torch.zeros_like(index[0], dtype=torch.bool)
+            for axis in index:
+                known = 2.0 * axis.detach()
+                close |= (known - known.round()).abs() < 2.0 * GUARD
+            # Sites not in front are sent to an integer; what is close to them is the near plane, which scenes avoid.
+            self.close.append(close & front.expand(close.shape))
+            return self.inner(source, index, front, options)
+
+        reference._sample = watching
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        reference._sample = self.inner
+
+
+def _answer(call: Call, leaves: Sequence[Tensor], cotangent: Tensor | None, backend: str) -> list[Tensor]:
+    leaves = [leaf.detach().clone().requires_grad_() for leaf in leaves]
+    values, visible = call.run(*leaves, backend=backend)
+    if cotangent is None:
+        return [values.detach(), visible]
+    gradients = torch.autograd.grad(values, leaves, cotangent.to(values.dtype), allow_unused=True)
+    return [torch.zeros_like(leaf) if part is None else part for part, leaf in zip(gradients, leaves, strict=True)]
+
+
+def _double(leaves: Sequence[Tensor]) -> list[Tensor]:
+    return [leaf.double() for leaf in leaves]
+
+
+def _spread(close: Tensor, values: Tensor, reduced: bool, flat: int | None) -> Tensor:
+    """Kinks (B, V, *sites) to the shape of the values."""
+    if reduced:
+        close = close.any(1, keepdim=True)
+    if flat is not None:  # channels times planes
+        return close.repeat(1, 1, values.shape[2] // flat, 1, 1)
+    close = close[:, 0][:, None] if reduced else close[:, :, None]
+    return close.expand(values.shape)
+
+
+def compare(call: Call, backend: str, reduced: bool = False, flat: int | None = None) -> None:
+    """Raise where a backend and the reference differ.
+
+    Args:
+        call: what to run, on float32 or half-precision leaves.
+        backend: its name.
+        reduced: whether views are reduced.
+        flat: the number of planes, where they are stacked with the channels.
+    """
+    assert call.name in OPERATORS
+    half = call.leaves[0].dtype not in (torch.float32, torch.float64)
+    with _Kinks() as kinks:
+        exact, seen = _answer(call, _double(call.leaves), None, "reference")
+    single = [leaf.float() for leaf in call.leaves]
+    rough, _ = _answer(call, single, None, "reference")
+    values, visible = _answer(call, call.leaves, None, backend)
+    assert values.shape == exact.shape
+    assert values.dtype == call.leaves[0].dtype
+    close = torch.cat(kinks.close, 2)
+    if call.name == "project_reduce":
+        ignored = close.any(2, keepdim=True).expand(exact.shape)
+    else:
+        ignored = _spread(close, exact, reduced, flat)
+    if bool((visible != seen)[~close].any()):
+        raise AssertionError(f"{call.name}: visibility differs at {int((visible != seen)[~close].sum())} samples")
+    _close(call.name, "values", values, rough, exact, ~ignored, half)
+    cotangent = torch.rand(exact.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(9)) - 0.5
+    cotangent = torch.where(ignored, 0.0, cotangent)
+    if half:
+        cotangent = cotangent.to(values.dtype).double()
+    wanted = _answer(call, _double(call.leaves), cotangent, "reference")
+    rough_gradients = _answer(call, single, cotangent, "reference")
+    found = _answer(call, call.leaves, cotangent, backend)
+    for number, (part, near, expected) in enumerate(zip(found, rough_gradients, wanted, strict=True)):
+        assert part.dtype == call.leaves[number].dtype
+        everywhere = torch.ones_like(expected, dtype=torch.bool)
+        _close(call.name, f"gradient {number}", part, near, expected, everywhere, half)
+
+
+def _close(name: str, what: str, found: Tensor, rough: Tensor, expected: Tensor, compared: Tensor, half: bool) -> None:
+    if not compared.any():
+        return
+    if not bool(found.isfinite().all()):
+        raise AssertionError(f"{name}: {what} not finite")
+    expected, found = expected[compared], found[compared]
+    largest = float(expected.abs().max())
+    allowed = TIMES * float((rough.double()[compared] - expected).abs().max()) + FLOOR * largest
+    error = (found.double() - expected).abs()
+    if half and found.dtype in tolerances.UNIT_ROUNDOFF:
+        # Values are rounded once, and so are the gradients that come in and go out.
+        times = 1.01 if what == "values" else 4.0
+        magnitude = expected.abs() if what == "values" else largest
+        error = error - times * tolerances.UNIT_ROUNDOFF[found.dtype] * magnitude
+        error = error - torch.finfo(found.dtype).smallest_normal * tolerances.UNIT_ROUNDOFF[found.dtype]
+    error = float(error.max())
+    if not error <= allowed:
+        raise AssertionError(f"{name}: {what} off by {error:.3g}, allowed {allowed:.3g}")

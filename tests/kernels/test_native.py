@@ -1,0 +1,316 @@
+"""The C++ kernels against the reference, in every instruction set that the machine has."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lsmgeo import functional, rays
+from lsmgeo._sites import image_sites, sweep_sites
+from lsmgeo.errors import BackendError
+from lsmgeo.kernels import Options, cpu, explain, fused
+from tests.kernels import cases
+from tests.kernels.comparison import Call, compare, sweep_call, unproject_call
+from tests.property import support
+from tests.strategies import Scene, scenes, sweep_depths
+
+REASON = cpu.why_not("unproject", torch.zeros(1), Options("bilinear"))
+pytestmark = pytest.mark.skipif(REASON is not None, reason=f"the C++ kernels: {REASON}")
+
+
+def instruction_sets() -> list[str]:
+    found = []
+    if REASON is None:
+        best = cpu.instruction_set()
+        for name in ("baseline", "avx2", "avx512"):
+            try:
+                found.append(cpu.instruction_set(name))
+            except ValueError:
+                continue
+        cpu.instruction_set(best)
+    return found
+
+
+@pytest.fixture(params=instruction_sets() or ["none"])
+def instruction_set(request):
+    before = cpu.instruction_set()
+    cpu.instruction_set(request.param)
+    yield request.param
+    cpu.instruction_set(before)
+
+
+@pytest.mark.parametrize("name", {**cases.CASES, **cases.HALF})
+def test_it_does_what_the_reference_does(name, instruction_set):
+    {**cases.CASES, **cases.HALF}[name]("cpu")
+
+
+STATISTICS = st.sampled_from([None, "mean", "variance", ("mean", "max")])
+MODES = st.sampled_from(["bilinear", "nearest"])
+PADDING = st.sampled_from(["zeros", "border"])
+EXTRA = st.sampled_from([(), ("depth",), ("direction",), ("depth", "direction")])
+
+
+def _inputs(scene: Scene) -> support.Inputs:
+    return support.inputs(scene.rounded(torch.float32), torch.float32)
+
+
+@support.FEWER
+@given(scenes(), STATISTICS, MODES, PADDING, EXTRA, st.booleans())
+def test_unproject_in_ugly_scenes(scene, reduce, mode, padding, extra, masked):
+    features, cameras, grid = _inputs(scene)
+    # Not at the camera itself: next to it the rounding of one coordinate turns the ray.
+    options = {"mode": mode, "padding_mode": padding, "augment": extra, "reduce": reduce, "near": 0.05}
+    if masked:
+        options["view_mask"] = torch.from_numpy(scene.view_mask)
+    compare(unproject_call(features, cameras, grid, **options), "cpu", reduced=reduce is not None)
+
+
+@st.composite
+def sweeps(draw):
+    scene = draw(scenes())
+    return scene, draw(sweep_depths(scene))
+
+
+@support.FEWER
+@given(sweeps(), MODES, PADDING, EXTRA, st.booleans())
+def test_plane_sweep_in_ugly_scenes(sweep, mode, padding, extra, flatten):
+    scene, depths = sweep
+    _, cameras, grid = _inputs(scene)
+    volume = torch.from_numpy(scene.volume).float()
+    options = {"mode": "trilinear" if mode == "bilinear" else mode, "padding_mode": padding, "augment": extra}
+    call = sweep_call(volume, cameras, grid, torch.from_numpy(depths), scene.size, flatten=flatten, **options)
+    compare(call, "cpu", flat=depths.shape[-1] if flatten else None)
+
+
+# Layouts
+
+
+def _answers(run, source: torch.Tensor, cotangent: torch.Tensor) -> list[torch.Tensor]:
+    leaf = source.detach().requires_grad_()
+    values, visible = run(leaf)
+    return [values.detach(), visible, *torch.autograd.grad(values, leaf, cotangent)]
+
+
+RUNS = {
+    "unproject": (lambda source: functional.unproject(source, cases.VIEWS, cases.GRID, backend="cpu"), cases.WIDE),
+    "mean": (
+        lambda source: functional.unproject(source, cases.VIEWS, cases.GRID, reduce="mean", backend="cpu"),
+        cases.WIDE,
+    ),
+    "sweep": (
+        lambda source: functional.plane_sweep_project(
+            source, cases.VIEWS, cases.GRID, cases.DEPTHS, cases.SIZE, flatten=False, backend="cpu"
+        ),
+        cases.WIDE_VOLUME,
+    ),
+    "stacked": (
+        lambda source: functional.plane_sweep_project(
+            source, cases.VIEWS, cases.GRID, cases.DEPTHS, cases.SIZE, backend="cpu"
+        ),
+        cases.WIDE_VOLUME,
+    ),
+}
+
+
+@pytest.fixture(params=RUNS)
+def operator(request):
+    return RUNS[request.param]
+
+
+def _twice(tensor: torch.Tensor) -> torch.Tensor:
+    """The same values with strides that no layout of PyTorch has."""
+    return torch.stack((tensor, tensor + 1.0), -1)[..., 0]
+
+
+def test_strides_change_nothing(operator):
+    run, source = operator
+    cotangent = torch.rand(run(source)[0].shape)
+    axis = 2 if source is cases.WIDE else 1
+    channels_last = source.movedim(axis, -1).contiguous().movedim(-1, axis)
+    expected = _answers(run, source, cotangent)
+    for other, incoming in ((channels_last, cotangent), (_twice(source), _twice(cotangent))):
+        for found, wanted in zip(_answers(run, other, incoming), expected, strict=True):
+            torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+
+
+def test_an_expanded_gradient_is_read_where_it_is(operator):
+    run, source = operator
+    shape = run(source)[0].shape
+    one = torch.full((), 0.75).expand(shape)
+    found = _answers(run, source, one)[2]
+    torch.testing.assert_close(found, _answers(run, source, one.clone())[2], rtol=0, atol=0)
+    assert found.abs().max() > 0
+
+
+def test_sums_expand_their_gradient(operator):
+    run, source = operator
+    leaf = source.clone().requires_grad_()
+    run(leaf)[0].sum().backward()
+    expected = _answers(run, source, torch.ones(run(source)[0].shape))[2]
+    torch.testing.assert_close(leaf.grad, expected, rtol=0, atol=0)
+
+
+def test_the_layouts_are_those_promised():
+    values, _ = RUNS["unproject"][0](cases.WIDE)
+    assert values.stride(2) == 1
+    maps, _ = RUNS["stacked"][0](cases.WIDE_VOLUME)
+    assert maps.flatten(0, 1).is_contiguous(memory_format=torch.channels_last)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_the_same_bits_from_run_to_run(operator, threads):
+    run, source = operator
+    cotangent = torch.rand(run(source)[0].shape)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        first = _answers(run, source, cotangent)
+        for _ in range(3):
+            for found, expected in zip(_answers(run, source, cotangent), first, strict=True):
+                assert torch.equal(found, expected)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_memory_that_is_given_is_written_to():
+    options = Options.checked("test", volume=False)
+    sites = image_sites("test", cases.WIDE, cases.VIEWS, cases.GRID, None, options)
+    expected, _ = cpu.images(cases.WIDE, sites, options)
+    out = torch.full(expected.shape, torch.nan)  # contiguous, unlike what the kernel would make
+    found, _ = cpu.images(cases.WIDE, sites, options, out)
+    assert found is out
+    torch.testing.assert_close(out, expected, rtol=0, atol=0)
+    needs = (True, False, False, False)
+    gradient, *_ = cpu.images_backward(expected, cases.WIDE, sites, options, needs)
+    into = torch.ones_like(gradient)
+    cpu.images_backward(expected, cases.WIDE, sites, options, needs, into)
+    torch.testing.assert_close(into, gradient + 1.0)
+
+
+def test_half_volumes_swept_into_float32():
+    options = Options.checked("test", volume=True)
+    volume = cases.VOLUME.bfloat16()
+    sites = sweep_sites("test", volume, cases.VIEWS, cases.GRID, cases.DEPTHS, cases.SIZE, None, options)
+    expected, _ = cpu.volume(volume.float(), sites, options)
+    out = torch.empty(expected.shape)
+    cpu.volume(volume, sites, options, out)
+    torch.testing.assert_close(out, expected, rtol=1e-6, atol=1e-6)
+
+
+# Registration
+
+
+# opcheck looks at the gradients of tensors that have none.
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
+@pytest.mark.parametrize("operator", ["images", "pixels", "volume", "project_reduce"])
+def test_opcheck(operator):
+    options = Options.checked("test", volume=operator in ("volume", "project_reduce"), augment="depth")
+    flat = fused._flat(options)
+    leaf = (cases.FEATURES if operator in ("images", "pixels") else cases.VOLUME).clone().requires_grad_()
+    if operator == "pixels":
+        arguments = (leaf, cases.PIXELS.clone().requires_grad_(), cases.VALID, cases.DISTANCE[:, :, None])
+    elif operator == "images":
+        arguments = (leaf, *image_sites("test", leaf, cases.VIEWS, cases.GRID, cases.MASK, options))
+    else:
+        arguments = (
+            leaf,
+            *sweep_sites("test", leaf, cases.VIEWS, cases.GRID, cases.DEPTHS, cases.SIZE, None, options),
+        )
+        if operator == "project_reduce":
+            planes = cases.DEPTHS.shape[0]
+            arguments = (*arguments, torch.rand(3, cases.C + 1, planes, requires_grad=True), None)
+    torch.library.opcheck(getattr(torch.ops.lsmgeo, operator).default, (*arguments, *flat, "cpu"))
+
+
+def test_second_derivatives_are_those_of_the_reference():
+    def second(call: Call, backend: str) -> list[torch.Tensor]:
+        leaves = [leaf.detach().clone().requires_grad_() for leaf in call.leaves]
+        values, _ = call.run(*leaves, backend=backend)
+        weights = torch.linspace(0.1, 1.0, values.numel()).reshape(values.shape)
+        first = torch.autograd.grad((values * weights).sum(), leaves, create_graph=True)
+        total = sum((part * part.detach().cos()).sum() for part in first)
+        parts = torch.autograd.grad(total, leaves, allow_unused=True)
+        return [torch.zeros_like(x) if p is None else p for p, x in zip(parts, leaves, strict=True)]
+
+    for call in (
+        unproject_call(cases.FEATURES, cases.VIEWS, cases.GRID, near=0.1),
+        sweep_call(cases.VOLUME, cases.VIEWS, cases.GRID, cases.DEPTHS, cases.SIZE),
+    ):
+        for found, expected in zip(second(call, "cpu"), second(call, "reference"), strict=True):
+            largest = float(expected.abs().max())
+            torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3 * largest)
+
+
+def test_autocast_changes_nothing(operator):
+    run, source = operator
+    expected, _ = run(source)
+    with torch.autocast("cpu", torch.bfloat16):
+        found, _ = run(source)
+    torch.testing.assert_close(found, expected, rtol=0, atol=0)
+
+
+def test_nothing_of_the_size_of_all_views_is_kept():
+    features = torch.rand(1, 12, 4, 6, 7, requires_grad=True)
+    views = cases.cameras.orbit(torch.arange(12.0)[None] * 30.0, 10.0, 2.0, focal_length=20.0, height=12, width=14)
+    kept = []
+    with torch.autograd.graph.saved_tensors_hooks(lambda tensor: kept.append(tensor.nbytes) or tensor, lambda t: t):
+        volume, _ = functional.unproject(features, views, cases.VoxelGrid(16), reduce="variance", backend="cpu")
+    assert volume.requires_grad
+    assert sum(kept) < 4 * features.numel() + 20_000
+
+
+# Absence
+
+
+def _child(code: str, **environment: str) -> str:
+    result = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, **environment}, capture_output=True, text=True, check=True
+    )
+    return result.stdout
+
+
+def test_it_can_be_turned_off():
+    code = (
+        "import torch; from lsmgeo import kernels;"
+        "kernels.explain('unproject', torch.zeros(1, 2, 3, 4, 5));"
+        "print(kernels.cpu.fresh((2, 3), torch.float32).shape)"
+    )
+    text = _child(code, LSMGEO_NATIVE="0")
+    assert "cpu: turned off by LSMGEO_NATIVE=0" in text
+    assert "reference: taken" in text
+    assert "torch.Size([2, 3])" in text
+
+
+def test_a_file_that_is_no_library_is_a_reason(tmp_path: Path):
+    broken = tmp_path / "_native.abi3.so"
+    broken.write_bytes(b"not a library")
+    reason = cpu.load(broken)
+    assert isinstance(reason, str)
+    assert "_native.abi3.so does not load" in reason
+
+
+def test_explain_takes_it(capsys):
+    explain("unproject", cases.FEATURES)
+    assert "  cpu: taken" in capsys.readouterr().out
+
+
+def test_named_for_float64_it_says_why():
+    with pytest.raises(BackendError, match="cpu: float64 stays on the reference path"):
+        functional.unproject(cases.FEATURES.double(), cases.VIEWS, cases.GRID, backend="cpu")
+
+
+@pytest.mark.parametrize("planes", [1, 5])
+def test_reduced_sweep_in_half_precision(planes):
+    weight = torch.rand(3, cases.C * planes)
+    given = (cases.VIEWS, cases.GRID, cases.DEPTHS[:planes], weight, None, cases.SIZE)
+    found, _ = rays.project_reduce(cases.VOLUME.half(), *given, backend="cpu")
+    expected, _ = rays.project_reduce(cases.VOLUME.half(), *given, backend="reference")
+    assert found.dtype == torch.float16
+    torch.testing.assert_close(found, expected, rtol=2e-3, atol=2e-3)

@@ -1,0 +1,39 @@
+"""Every fault in the C++ kernels is noticed by a comparison with the reference, and the kernels as they are pass all."""
+
+from __future__ import annotations
+
+import ctypes
+
+import pytest
+import torch
+
+from lsmgeo.kernels import cpu
+from tests.kernels.cases import CASES, HALF
+from tests.kernels.native_faults import FAULTS, build, compiler
+
+pytestmark = pytest.mark.skipif(compiler() is None, reason="needs a C++ compiler")
+
+
+def _noticed(monkeypatch, folder, fault: str | None) -> list[str]:
+    library = cpu.load(build(folder, fault))
+    assert isinstance(library, ctypes.CDLL), library
+    monkeypatch.setattr(cpu, "_library", lambda: library)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)  # so that channels are split in chunks
+    found = []
+    for name, case in {**CASES, **HALF}.items():
+        try:
+            case("cpu")
+        except (AssertionError, RuntimeError):
+            found.append(name)
+            if fault is not None:
+                break
+    return found
+
+
+def test_the_kernels_as_they_are(monkeypatch, tmp_path):
+    assert _noticed(monkeypatch, tmp_path, None) == []
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_noticed(monkeypatch, tmp_path, fault):
+    assert _noticed(monkeypatch, tmp_path, fault), f"no comparison notices: {fault}"

@@ -79,13 +79,13 @@ def slope(x: Sequence[float], y: Sequence[float]) -> float:
 def fused(settings: Settings) -> list[dict[str, Any]]:
     """A sweep and a 1x1 convolution, in one call and in two."""
     problem = settings.sized(REDUCE)
-    names = (who.OURS, who.UNFUSED, who.HAND)
+    names = (who.OURS, who.UNFUSED)
     label = f"Sweep and 1x1 map, {problem.C} x {problem.planes} to {problem.outputs}"
     cases = timings(label, problem, names, repeats=settings.repeats, budget=15.0)
     for case in cases:
         threads = torch.get_num_threads()
         taken = {name: memory.measure(problem, name, case["kind"], threads) for name in names}
-        reasons = [taken[name]["left_out"] for name in names[:2] if "left_out" in taken[name]]
+        reasons = [taken[name]["left_out"] for name in names if "left_out" in taken[name]]
         saved = None if reasons else taken[who.UNFUSED]["above"] / max(taken[who.OURS]["above"], 1)
         time = cases_ratio(case)
         case["memory"] = taken

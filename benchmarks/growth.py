@@ -21,8 +21,8 @@ AXES: dict[str, dict[str, tuple[Any, ...]]] = {
     "Unproject, mean": {
         "voxels": (16, 32, 64, 128),
         "V": (1, 2, 4, 8, 16, 32),
-        "C": (8, 16, 32, 64, 128),
-        "size": (28, 56, 112, 224),
+        "C": (8, 32, 128),
+        "size": (28, 112, 224),
         "dtype": ("float32", "bfloat16", "float16"),
         "threads": (1, 2),
     },

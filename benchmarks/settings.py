@@ -61,6 +61,7 @@ def parse(description: str | None, argv: Sequence[str] | None) -> Settings:
     parser.add_argument("--results", type=Path, help="folder for the JSON; by default benchmarks/results")
     options = parser.parse_args(argv)
     torch.set_num_threads(options.threads)
+    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")  # no pool of processes beside the timings
     if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
         cache = tempfile.mkdtemp(prefix="lsmgeo-benchmarks-")
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = cache

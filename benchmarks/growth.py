@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from benchmarks import contenders as who
-from benchmarks import memory, report, timing
+from benchmarks import memory, report
 from benchmarks.measure import timings
 from benchmarks.problems import Problem
 from benchmarks.settings import Settings, parse
@@ -56,7 +56,7 @@ def point(label: str, problem: Problem, axis: str, value: Any, settings: Setting
         left_out[who.COMPILED_ANY] = "compiled for one number of threads"
     names = [name for name in names if name not in left_out]
     try:
-        cases = timings(f"{label}, {axis} = {value}", problem, names, repeats=settings.repeats, budget=2.5)
+        cases = timings(f"{label}, {axis} = {value}", problem, names, repeats=settings.repeats, budget=2.5, fewest=3)
     finally:
         torch.set_num_threads(threads)
     for case in cases:
@@ -69,7 +69,6 @@ def point(label: str, problem: Problem, axis: str, value: Any, settings: Setting
 
 def main(argv: Sequence[str] | None = None) -> None:
     settings = parse(__doc__, argv)
-    timing.FEWEST = 3
     cases = []
     for label, base in BASES.items():
         axes = {axis: AXES[label][axis][:2] for axis in ("voxels", "dtype")} if settings.quick else AXES[label]

@@ -24,6 +24,7 @@ def timings(
     kernels: bool = False,
     repeats: int | None = None,
     budget: float = 10.0,
+    fewest: int = timing.FEWEST,
 ) -> list[dict[str, Any]]:
     """A case for each kind: times of each contender, seconds of first calls, and who was left out and why.
 
@@ -49,7 +50,7 @@ def timings(
             turns[contenders.COLD] = floor.cold(problem.result_bytes)
             turns[contenders.WARM] = floor.warm(problem.result_bytes)
         gc.collect()
-        seconds = timing.interleaved(turns, repeats, budget=budget, device=problem.device)
+        seconds = timing.interleaved(turns, repeats, budget=budget, fewest=fewest, device=problem.device)
         cases.append(
             {
                 "case": f"{label}, {kind}",

@@ -38,11 +38,12 @@ def interleaved(
     repeats: int | None = None,
     warm_up: int = 1,
     budget: float = 10.0,
+    fewest: int = FEWEST,
     device: str = "cpu",
 ) -> dict[str, list[float]]:
     """Seconds of each run: one after another in turn, so that a busy moment meets all alike; the order alternates.
 
-    Without `repeats` there are as many rounds as fit into `budget` seconds, between `FEWEST` and `MOST`.
+    Without `repeats` there are as many rounds as fit into `budget` seconds, between `fewest` and `MOST`.
     """
     names = list(runs)
 
@@ -53,7 +54,7 @@ def interleaved(
     for number in range(warm_up):
         spent = sum(turn(number).values())
     if repeats is None:
-        repeats = min(MOST, max(FEWEST, int(budget / max(spent, 1e-6))))
+        repeats = min(MOST, max(fewest, int(budget / max(spent, 1e-6))))
     rounds = [turn(number) for number in range(repeats)]
     return {name: [taken[name] for taken in rounds] for name in names}
 

@@ -16,7 +16,7 @@ CORE := lsmgeo/_*.py,lsmgeo/errors.py,lsmgeo/debugging.py,lsmgeo/grids.py,lsmgeo
 CORE_COVERAGE := 95
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-long lint docs bench wheel clean
+.PHONY: help setup demo test test-bare test-long lint docs bench wheel clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -63,6 +63,11 @@ test: $(VENV)/.dev ## whole suite, doctests, and the core's coverage
 	@echo 'lines of the core:'
 	@$(BIN)/coverage report --include='$(CORE)' --fail-under=$(CORE_COVERAGE)
 
+# The operators on PyTorch alone: what runs where nothing was compiled and Triton is absent.
+test-bare: $(VENV)/.dev ## the operators' tests without the C++ kernels and without Triton
+	LSMGEO_NATIVE=0 LSMGEO_TEST_WITHOUT_TRITON=1 HYPOTHESIS_PROFILE=dev $(PYTEST) -n $(JOBS) --dist worksteal \
+		-m 'not long' lsmgeo/kernels tests/kernels tests/property tests/structure
+
 test-long: $(VENV)/.dev ## the long forms: random examples in number, slow checks
 	HYPOTHESIS_PROFILE=long $(PYTEST) -n $(JOBS) --dist worksteal --timeout 3600 --durations=20
 
@@ -76,7 +81,7 @@ docs: $(VENV)/.dev ## pages and executed gallery, to docs/_build/html
 	OMP_NUM_THREADS=$(JOBS) $(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
 	@echo 'docs: docs/_build/html/index.html'
 
-bench: $(VENV)/.dev ## the reference path against hand-written projection and grid_sample
+bench: $(VENV)/.dev ## the operators against hand-written, compiled and other systems' forms; time and memory
 	$(BIN)/python -m benchmarks
 
 wheel: $(VENV)/.core ## build the wheel, install it into a clean environment, run the demo from there

@@ -1,8 +1,12 @@
-"""Hypothesis profiles, chosen by ``HYPOTHESIS_PROFILE``: ci (default), dev, long. One thread, so that runs repeat."""
+"""Hypothesis profiles, chosen by ``HYPOTHESIS_PROFILE``: ci (default), dev, long. One thread, so that runs repeat.
+
+``LSMGEO_TEST_WITHOUT_TRITON=1`` makes Triton impossible to import, as where it is not installed.
+"""
 
 from __future__ import annotations
 
 import os
+import sys
 
 import torch
 from hypothesis import HealthCheck, settings
@@ -14,3 +18,6 @@ settings.register_profile("long", max_examples=5000, **_COMMON)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 torch.set_num_threads(1)
+
+if os.environ.get("LSMGEO_TEST_WITHOUT_TRITON") == "1":
+    sys.modules["triton"] = None  # type: ignore[assignment]

@@ -44,11 +44,19 @@ def why_not(operator: str, source: Tensor, options: Options) -> str | None:
     """Why these kernels cannot run a call; None if they can."""
     if source.dtype == torch.float64:
         return "float64 stays on the reference path"
-    if importlib.util.find_spec("triton") is None:
+    if not _is_installed():
         return "Triton is not installed"
     if source.device.type != "cuda" and not (source.device.type == "cpu" and _is_interpreted()):
         return f"its kernels are for CUDA tensors, these are on {source.device.type} (or TRITON_INTERPRET=1, to debug)"
     return None
+
+
+def _is_installed() -> bool:
+    return importlib.util.find_spec("triton") is not None
+
+
+# torch.compile takes the answer as a constant instead of looking into the search for a module.
+_is_installed._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def _is_interpreted() -> bool:

@@ -13,8 +13,8 @@ Importing this module imports Triton.
 
 from __future__ import annotations
 
-import triton  # type: ignore[import-untyped]
-import triton.language as tl  # type: ignore[import-untyped]
+import triton
+import triton.language as tl
 
 from lsmgeo.kernels.gpu_types import (
     DIRECTION_FIELDS,

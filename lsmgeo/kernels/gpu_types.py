@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import triton.language as tl  # type: ignore[import-untyped]
+import triton.language as tl
 
 __all__ = [
     "DIRECTION_FIELDS",

@@ -24,27 +24,52 @@ FAULTS = {
     "slope beyond the border": ("index > 0.0f && index < size - 1.0f ? 1.0f : 0.0f", "1.0f"),
     "weights of x and y swapped": ("tile.weight[1][s] = x * near;", "tile.weight[1][s] = (1.0f - x) * next;"),
     "last tap dropped": ("tile.weight[7][s] = x * y * z;", "tile.weight[7][s] = 0.0f;"),
-    "edge taps not weighted": ("const float weight = weight_of<DIMS>(tile, s, tap) * factor;", "const float weight = factor;"),
+    "edge taps not weighted": (
+        "const float weight = weight_of<DIMS>(tile, s, tap) * factor;",
+        "const float weight = factor;",
+    ),
     "rest of the channels forgotten": ("for (; c < channels; c++) body", "for (; c < channels - 1; c++) body"),
-    "slope with the wrong sign": ("slope[tap][axis] = tap >> axis & 1 ? rest : -rest;", "slope[tap][axis] = tap >> axis & 1 ? -rest : rest;"),
+    "slope with the wrong sign": (
+        "slope[tap][axis] = tap >> axis & 1 ? rest : -rest;",
+        "slope[tap][axis] = tap >> axis & 1 ? -rest : rest;",
+    ),
     "depth without its slope": ("rows[2][s] += float(by_height);", ""),
-    "height's part forgotten": ("rows[2][s] = -(rows[0][s] * tile.index[0][s]", "rows[2][s] = -(0.0f * tile.index[0][s]"),
+    "height's part forgotten": (
+        "rows[2][s] = -(rows[0][s] * tile.index[0][s]",
+        "rows[2][s] = -(0.0f * tile.index[0][s]",
+    ),
     "inverse depth's part forgotten": ("by_z[s] -= by_plane * tile.plane[row][s] * tile.depth[s];", ""),
-    "direction's slope not projected": ("(by_direction[row][s] - along * tile.direction[row][s])", "by_direction[row][s]"),
-    "direction not normalised": ("tile.shrink[s] = away ? 1.0f / std::sqrt(away ? squares : 1.0f) : 0.0f;", "tile.shrink[s] = 1.0f;"),
-    "depth after direction": ("if (call.depth) *out++ = tile.distance[s];\n    if (call.direction)\n        for (int row = 0; row < 3; row++) *out++ = tile.direction[row][s];",
-        "if (call.direction)\n        for (int row = 0; row < 3; row++) *out++ = tile.direction[row][s];\n    if (call.depth) *out++ = tile.distance[s];"),
-    "mean over all views": ("Floats<W> mean = {};\n    for (int64_t v = 0; v < count; v++) mean += read<W>(values + v * step) * share;",
-        "Floats<W> mean = {};\n    for (int64_t v = 0; v < count; v++) mean += read<W>(values + v * step) * 0.3333333f;"),
+    "direction's slope not projected": (
+        "(by_direction[row][s] - along * tile.direction[row][s])",
+        "by_direction[row][s]",
+    ),
+    "direction not normalised": (
+        "tile.shrink[s] = away ? 1.0f / std::sqrt(away ? squares : 1.0f) : 0.0f;",
+        "tile.shrink[s] = 1.0f;",
+    ),
+    "direction in y, z, x order": (
+        "*out++ = tile.direction[row][s];",
+        "*out++ = tile.direction[(row + 1) % 3][s];",
+    ),
+    "mean over all views": (
+        "mean += read<W>(values + v * step) * share;",
+        "mean += read<W>(values + v * step) * 0.3333333f;",
+    ),
     "blind views counted": ("if (!tiles[v].visible[s]) continue;\n        float *out", "float *out"),
-    "unbiased variance": ("result += apart * apart * share;", "result += apart * apart / float(count > 1 ? count - 1 : 1);"),
+    "unbiased variance": (
+        "result += apart * apart * share;",
+        "result += apart * apart / float(count > 1 ? count - 1 : 1);",
+    ),
     "maximum's gradient to all views": ("part = taker == int32_t(v) ? gradient : Floats<W>{};", "part = gradient;"),
     "mean's gradient not shared": ("Floats<W> part = gradient * share;", "Floats<W> part = gradient;"),
-    "first chunk's channels for all": ("const S *source = source_of<S>(call, scene, view) + channel;", "const S *source = source_of<S>(call, scene, view);"),
+    "first chunk's channels for all": (
+        "const S *source = source_of<S>(call, scene, view) + channel;",
+        "const S *source = source_of<S>(call, scene, view);",
+    ),
     "gradient not cleared": ("if (!call.source_gradient || call.accumulate) return;", "return;"),
     "bfloat16 cut off": ("(bits + 0x7fff + (bits >> 16 & 1)) >> 16;", "bits >> 16;"),
     "float16 denormals lost": ("magnitude < (113u << 23) ? small : normal", "magnitude < (113u << 23) ? 0u : normal"),
-}  # fmt: skip
+}
 
 
 def compiler() -> str | None:

@@ -1,4 +1,4 @@
-"""Every fault in the C++ kernels is noticed by a comparison with the reference, and the kernels as they are pass all."""
+"""Every fault in the C++ kernels is noticed by a comparison with the reference; the kernels as they are pass all."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@
 #include <system_error>
 #include <thread>
 #include <type_traits>
+#include <utility>
 #include <vector>
 
 #if defined(__linux__)
@@ -197,7 +198,13 @@ int run(const Call &call, bool backward) {
     const int64_t of_values = std::max(chosen.needs.length, call.statistics ? call.views : 0) * plan.channels;
     const int64_t floats = 2 * of_values + statistics * chosen.needs.length * plan.channels + plan.channels;
     const int64_t bytes = tiles * (chosen.needs.tile + chosen.needs.geometric) + 4 * floats + 8 * call.views + 256;
-    std::atomic<int64_t> next(0), failures(0);
+    // Each thread starts in a part of its own and then helps the others: two threads side by side would fault in, and
+    // clear, the same fresh pages.
+    const int64_t threads = std::max<int64_t>(1, std::min(call.threads, tasks));
+    std::unique_ptr<std::atomic<int64_t>[]> next(new (std::nothrow) std::atomic<int64_t>[size_t(threads)]);
+    if (!next) return 1;
+    for (int64_t part = 0; part < threads; part++) next[size_t(part)] = part * tasks / threads;
+    std::atomic<int64_t> arrived(0), failures(0);
     auto body = [&]() {
         std::unique_ptr<char[]> memory(new (std::nothrow) char[size_t(bytes)]);
         if (!memory) {
@@ -220,11 +227,15 @@ int run(const Call &call, bool backward) {
         room.reduced = reinterpret_cast<float *>(reserve(4 * statistics * chosen.needs.length * plan.channels));
         room.nothing = reinterpret_cast<float *>(reserve(4 * plan.channels));
         std::fill(room.nothing, room.nothing + plan.channels, 0.0f);
-        for (int64_t task = next++; task < tasks; task = next++) chosen.run(plan, task, room);
+        const int64_t own = arrived++;
+        for (int64_t turn = 0; turn < threads; turn++) {
+            const int64_t part = (own + turn) % threads, last = (part + 1) * tasks / threads;
+            std::atomic<int64_t> &place = next[size_t(part)];
+            for (int64_t task = place++; task < last; task = place++) chosen.run(plan, task, room);
+        }
     };
-    const int64_t threads = std::min(call.threads, tasks);
     on_threads(threads, body);
-    return failures.load() >= std::max<int64_t>(threads, 1) ? 1 : 0;
+    return failures.load() >= threads ? 1 : 0;
 }
 
 }  // namespace

@@ -83,6 +83,40 @@ template <class Body> INLINE void over_channels(int64_t channels, Body body) {
     for (; c < channels; c++) body(std::integral_constant<int, 1>(), c);
 }
 
+// One step of turning a square block: exchanges its off-diagonal squares of K by K.
+template <int K, int... I>
+INLINE void exchange(Floats<LANES> &a, Floats<LANES> &b, std::integer_sequence<int, I...>) {
+    const Floats<LANES> first = __builtin_shufflevector(a, b, (I & K ? LANES + I - K : I)...);
+    b = __builtin_shufflevector(a, b, (I & K ? LANES + I : I + K)...);
+    a = first;
+}
+
+template <int K> INLINE void turn(Floats<LANES> *rows) {
+    if constexpr (K > 0) {
+        for (int row = 0; row < LANES; row++)
+            if (!(row & K)) exchange<K>(rows[row], rows[row + K], std::make_integer_sequence<int, LANES>());
+        turn<K / 2>(rows);
+    }
+}
+
+// to[column * to_step + row] = from[row * from_step + column]
+inline void transpose(const float *from, int64_t from_step, float *to, int64_t to_step, int64_t rows, int64_t columns) {
+    int64_t row = 0;
+    for (; row + LANES <= rows; row += LANES) {
+        int64_t column = 0;
+        for (; column + LANES <= columns; column += LANES) {
+            Floats<LANES> square[LANES];
+            for (int r = 0; r < LANES; r++) square[r] = read<LANES>(from + (row + r) * from_step + column);
+            turn<LANES / 2>(square);
+            for (int c = 0; c < LANES; c++) write<LANES>(to + (column + c) * to_step + row, square[c]);
+        }
+        for (; column < columns; column++)
+            for (int r = 0; r < LANES; r++) to[column * to_step + row + r] = from[(row + r) * from_step + column];
+    }
+    for (int64_t column = 0; column < columns; column++)
+        for (int64_t r = row; r < rows; r++) to[column * to_step + r] = from[r * from_step + column];
+}
+
 INLINE float sum_of(Floats<1> values) { return values[0]; }
 INLINE float sum_of(Floats<4> values) { return (values[0] + values[2]) + (values[1] + values[3]); }
 INLINE float sum_of(Floats<8> values) {
@@ -306,7 +340,7 @@ INLINE void mix(const S *const *place, const float *weight, int64_t channels, fl
     });
 }
 
-// The value at site s, by a factor.
+// The value at site s, by a factor; added to what is there if asked.
 template <int DIMS, class S>
 inline void gather(const Call &call, const Tile &tile, int s, const S *source, const int64_t *stride, int64_t channels,
                    float *out, float factor = 1.0f, bool add = false) {
@@ -442,7 +476,9 @@ inline void store_block(S *values, const Layout &at, int64_t sites, int64_t chan
 }
 
 inline void put(const Call &call, const Layout &at, int64_t sites, int64_t channels, const float *block) {
-    if (call.values_type == FLOAT32) store_block(static_cast<float *>(call.values), at, sites, channels, block);
+    if (call.values_type == FLOAT32 && at.site == 1)
+        transpose(block, channels, static_cast<float *>(call.values) + at.base, at.channel, sites, channels);
+    else if (call.values_type == FLOAT32) store_block(static_cast<float *>(call.values), at, sites, channels, block);
     else if (call.values_type == BFLOAT16) store_block(static_cast<Bfloat16 *>(call.values), at, sites, channels, block);
     else store_block(static_cast<Float16 *>(call.values), at, sites, channels, block);
 }
@@ -467,7 +503,8 @@ inline Block take(const Call &call, const Tile &tile, int64_t channel, int64_t c
     if (call.gradient_type == FLOAT32) {
         const float *values = static_cast<const float *>(call.gradient);
         if (at.channel == 1) return {values + at.base, at.site};
-        load_block(values, at, tile.number, channels, room);
+        if (at.site == 1) transpose(values + at.base, at.channel, room, channels, channels, tile.number);
+        else load_block(values, at, tile.number, channels, room);
     } else if (call.gradient_type == BFLOAT16) {
         load_block(static_cast<const Bfloat16 *>(call.gradient), at, tile.number, channels, room);
     } else {

@@ -66,7 +66,7 @@ test: $(VENV)/.dev ## whole suite, doctests, and the core's coverage
 # The operators on PyTorch alone: what runs where nothing was compiled and Triton is absent.
 test-bare: $(VENV)/.dev ## the operators' tests without the C++ kernels and without Triton
 	LSMGEO_NATIVE=0 LSMGEO_TEST_WITHOUT_TRITON=1 HYPOTHESIS_PROFILE=dev $(PYTEST) -n $(JOBS) --dist worksteal \
-		-m 'not long' lsmgeo/kernels tests/kernels tests/property tests/structure
+		-m 'not long' lsmgeo tests/kernels tests/property tests/structure
 
 test-long: $(VENV)/.dev ## the long forms: random examples in number, slow checks
 	HYPOTHESIS_PROFILE=long $(PYTEST) -n $(JOBS) --dist worksteal --timeout 3600 --durations=20

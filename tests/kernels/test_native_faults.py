@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 
 import pytest
 import torch
@@ -11,7 +12,10 @@ from lsmgeo.kernels import cpu
 from tests.kernels.cases import CASES, HALF
 from tests.kernels.native_faults import FAULTS, build, compiler
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="needs a C++ compiler")
+pytestmark = [
+    pytest.mark.skipif(compiler() is None, reason="needs a C++ compiler"),
+    pytest.mark.skipif(os.environ.get("LSMGEO_NATIVE") == "0", reason="the C++ kernels are turned off"),
+]
 
 
 def _noticed(monkeypatch, folder, fault: str | None) -> list[str]:

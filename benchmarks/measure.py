@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import sys
+import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -31,6 +33,7 @@ def timings(
     Raises:
         gate.Different: one of them computes something else.
     """
+    started = time.perf_counter()
     scene = Scene(problem)
     runs, left_out = contenders.gather(scene, names)
     cotangents, first = gate.check(scene, runs, backward="forward+backward" in kinds)
@@ -61,6 +64,7 @@ def timings(
                 "left_out": left_out,
             }
         )
+    print(f"  {label}: {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)
     return cases
 
 

@@ -28,6 +28,10 @@ FAULTS = {
         "const float weight = weight_of<DIMS>(tile, s, tap) * factor;",
         "const float weight = factor;",
     ),
+    "tiles at the volume's edge passed over": (
+        "if (index[axis][0] < -1.01 && index[axis][1] < -1.01) return true;",
+        "if (index[axis][0] < 0.4 && index[axis][1] < 0.4) return true;",
+    ),
     "rest of the channels forgotten": ("for (; c < channels; c++) body", "for (; c < channels - 1; c++) body"),
     "slope with the wrong sign": (
         "slope[tap][axis] = tap >> axis & 1 ? rest : -rest;",

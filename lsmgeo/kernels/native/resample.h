@@ -564,6 +564,47 @@ inline void axis_strides(const int64_t *stride, int64_t *axes) {  // to the orde
     axes[2] = stride[2];
 }
 
+// Whether no site of a tile in a volume's lattice reads anything, seen from its two ends: indices change along a tile in
+// one direction. Much of a sweep lies beside the volume. Nothing is lost by a "no"; the margin is beyond rounding.
+inline bool is_beside(const Call &call, const View &view, const Tile &tile) {
+    if (call.kind != VOLUMES) return false;
+    if (view.masked) return true;
+    if (call.border) return false;
+    const int64_t last = tile.number - 1;
+    double index[3][2];
+    for (int end = 0; end < 2; end++) {
+        const double x = call.x[tile.i + (tile.along_z ? 0 : end * last)], y = call.y[tile.j];
+        const double depth = 1.0 / plane_z(call, tile, tile.k + (tile.along_z ? end * last : 0));
+        for (int row = 0; row < 3; row++) {
+            const double *m = view.matrix[row];
+            index[row][end] = (m[0] * x + m[1] * y + m[3]) * depth + m[2];
+        }
+    }
+    for (int axis = 0; axis < 3; axis++) {
+        const double high = double(call.size[axis]) + 0.01;
+        if (index[axis][0] < -1.01 && index[axis][1] < -1.01) return true;
+        if (index[axis][0] > high && index[axis][1] > high) return true;
+    }
+    return false;
+}
+
+// Zeros for a whole tile that nobody sees.
+inline void blank(const Call &call, const Tile &tile, const Layout &at) {
+    const int64_t n = call.sites[0] * call.sites[1], *size = call.sites;
+    const int64_t first = (((tile.scene * call.views + tile.view) * size[2] + tile.k) * size[1] + tile.j) * size[0] + tile.i;
+    for (int64_t s = 0; s < tile.number; s++) call.visible[first + s * (tile.along_z ? n : 1)] = 0;
+    float *out = static_cast<float *>(call.values) + at.base;
+    if (at.channel == 1 && at.site == call.channels) {
+        std::memset(out, 0, size_t(tile.number * call.channels) * sizeof(float));
+    } else if (at.site == 1) {
+        for (int64_t c = 0; c < call.channels; c++)
+            std::memset(out + c * at.channel, 0, size_t(tile.number) * sizeof(float));
+    } else {
+        for (int64_t s = 0; s < tile.number; s++)
+            for (int64_t c = 0; c < call.channels; c++) out[s * at.site + c * at.channel] = 0.0f;
+    }
+}
+
 // Forward, every view by itself: tiles first to last of one view.
 template <int DIMS, class S>
 void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_t last, Room &room) {
@@ -575,9 +616,13 @@ void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_
     const int64_t channels = plan.channels;
     for (int64_t number = first; number < last; number++) {
         start(plan, tile, scene, view, number);
+        const Layout at = layout(call.values_stride, tile);
+        if (channels == call.channels && call.values_type == FLOAT32 && is_beside(call, view_of(plan, tile), tile)) {
+            blank(call, tile, at);
+            continue;
+        }
         locate<DIMS>(call, view_of(plan, tile), tile);
         show(call, tile);
-        const Layout at = layout(call.values_stride, tile);
         const bool direct = call.values_type == FLOAT32 && at.channel == 1;
         float *out = direct ? static_cast<float *>(call.values) + at.base : room.values;
         const int64_t step = direct ? at.site : channels;

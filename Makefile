@@ -92,7 +92,7 @@ wheel: $(VENV)/.core ## build the wheel, install it into a clean environment, ru
 	cd build && clean/bin/lsmgeo demo --out wheel-demo
 	@ls -l dist
 
-clean: ## remove what the commands wrote; the environment stays
-	rm -rf build dist *.egg-info demo docs/_build docs/auto_examples docs/api/generated docs/sg_execution_times.rst
+clean: ## remove what the commands wrote and built; what was installed from elsewhere stays
+	rm -rf build dist *.egg-info lsmgeo/kernels/_native.* $(VENV)/.core $(VENV)/.dev demo docs/_build docs/auto_examples docs/api/generated docs/sg_execution_times.rst
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage .coverage.* htmlcov
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +

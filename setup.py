@@ -6,13 +6,14 @@ They are optional: without a C++ compiler the package installs and runs on PyTor
 from setuptools import Extension, setup
 
 NATIVE = "lsmgeo/kernels/native"
+HEADERS = ("call", "resample", "vectors", "places", "forward", "backward")
 
 setup(
     ext_modules=[
         Extension(
             "lsmgeo.kernels._native",
             [f"{NATIVE}/kernels.cpp"],
-            depends=[f"{NATIVE}/call.h", f"{NATIVE}/resample.h"],
+            depends=[f"{NATIVE}/{name}.h" for name in HEADERS],
             language="c++",
             # NaN and infinity keep their meaning. What is given up is to tell PyTorch of arithmetic exceptions.
             extra_compile_args=[

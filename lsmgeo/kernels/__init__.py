@@ -71,7 +71,7 @@ def explain(operator: str, source: Tensor, **options: Any) -> str:
     Args:
         operator: "unproject", "unproject_points", "sample_views", "plane_sweep_project" or "project_reduce".
         source: the features or volume of the call.
-        **options: options of the call: mode, padding_mode, augment, reduce, near.
+        **options: options of the call: mode, padding_mode, augment, direction_frame, reduce, near.
 
     Returns:
         One line a backend.

@@ -16,6 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from lsmgeo._dtypes import saturating_cast
 from lsmgeo.kernels.request import Options, Sites
 
 __all__ = [
@@ -89,9 +90,9 @@ def load(path: Path) -> ctypes.CDLL | str:
     """The library in a file, ready for calls, or why it cannot be used."""
     try:
         library = ctypes.CDLL(str(path))
-    except OSError as error:
+        library.lsmgeo_size_of_call.restype = ctypes.c_int64
+    except (OSError, AttributeError) as error:
         return f"{path.name} does not load: {error}"
-    library.lsmgeo_size_of_call.restype = ctypes.c_int64
     if library.lsmgeo_size_of_call() != ctypes.sizeof(_Call):
         return f"{path.name} was built from other sources; install again"
     library.lsmgeo_instruction_set.restype = ctypes.c_char_p
@@ -225,6 +226,8 @@ def _source_gradient(call: _Call, source: Tensor, axis: int, into: Tensor | None
     if into is None:
         order = [other for other in range(source.dim()) if other != axis]
         gradient = fresh(source.shape, torch.float32, [*order, axis])
+        if 0 in call.sites[:]:  # then no task runs that would clear it
+            gradient.zero_()
     elif into.shape[axis] > 1 and into.stride(axis) != 1:
         raise ValueError("the channels of a gradient to add to must be next to one another")
     else:
@@ -309,7 +312,7 @@ def images_backward(
     _run(call, backward=True)
     del kept
     if to_source is not None and into is None:
-        to_source = to_source.to(original.dtype)
+        to_source = saturating_cast(to_source, original.dtype)
     return to_source, *_together(parts)  # type: ignore[return-value]
 
 
@@ -364,16 +367,16 @@ def pixels_backward(
     else:
         _gradient(call, gradient, (*strides[:3], 0, 0, strides[3]))
     to_source = _source_gradient(call, source, 2, None) if needs[0] else None
-    to_pixels = torch.zeros(call.chunks, *pixels.shape) if needs[1] else None
+    to_pixels = torch.zeros((call.chunks, *pixels.shape), dtype=torch.float32) if needs[1] else None
     call.pixels_gradient = None if to_pixels is None else to_pixels.data_ptr()
     to_extra = None
     if needs[2] and extra is not None:
-        to_extra = torch.zeros(*front.shape, call.extra)
+        to_extra = torch.zeros((*front.shape, call.extra), dtype=torch.float32)
         call.extras_gradient = to_extra.data_ptr()
     _run(call, backward=True)
     del kept
     return (
-        None if to_source is None else to_source.to(original.dtype),
+        None if to_source is None else saturating_cast(to_source, original.dtype),
         None if to_pixels is None else to_pixels.sum(0).to(pixels.dtype),
         None if to_extra is None else to_extra.movedim(3, 2).to(extra.dtype),  # type: ignore[union-attr]
     )
@@ -414,5 +417,5 @@ def volume_backward(
     _run(call, backward=True)
     del kept
     if to_source is not None and into is None:
-        to_source = to_source.to(original.dtype)
+        to_source = saturating_cast(to_source, original.dtype)
     return to_source, *_together(parts)  # type: ignore[return-value]

@@ -157,13 +157,14 @@ def _backward(name: str, gradient: Tensor, given: dict[str, Any], needs: Sequenc
         found = kernels.pixels_backward(
             gradient, given["source"], given["pixels"], given["front"], given["extra"], options, needs
         )
+        found = (found[0], *(None if part is None else part.contiguous() for part in found[1:]))
     elif name == "project_reduce":
         found = _project_reduce_backward(kernels, gradient, given, options, needs)
     else:
         backward = getattr(kernels, f"{name}_backward")
         found = backward(gradient, given["source"], _sites(given), options, needs)
-    none = gradient.new_empty(0)
-    return [none if part is None or not need else part for part, need in zip(found, needs, strict=True)]
+    pairs = zip(found, needs, strict=True)
+    return [gradient.new_empty(0) if part is None or not need else part for part, need in pairs]
 
 
 def _backward_shapes(name: str, gradient: Tensor, given: dict[str, Any], needs: Sequence[bool]) -> list[Tensor]:
@@ -174,7 +175,7 @@ def _backward_shapes(name: str, gradient: Tensor, given: dict[str, Any], needs: 
         "direction": lambda: given["matrix"].new_empty(given["matrix"].shape),
         "z": lambda: given["matrix"].new_empty((*given["matrix"].shape[:2], given["z"].shape[-1])),
         "pixels": lambda: given["pixels"].new_empty(given["pixels"].shape),
-        "extra": lambda: _channels_last(given["extra"], given["extra"].shape, 2, given["extra"].dtype),
+        "extra": lambda: given["extra"].new_empty(given["extra"].shape),
         "weight": lambda: given["weight"].new_empty(given["weight"].shape),
         "bias": lambda: given["bias"].new_empty(given["bias"].shape),
     }
@@ -356,7 +357,7 @@ def _project_reduce_backward(
     to_bias = None
     if needs_bias:
         to_bias = gradient.sum((0, 1, 3, 4), dtype=torch.float32).to(given["bias"].dtype)
-    to_source = None if to_source is None else to_source.to(original.dtype)
+    to_source = None if to_source is None else saturating_cast(to_source, original.dtype)
     return to_source, *parts, to_weight, to_bias
 
 

@@ -265,7 +265,7 @@ def volume(source: Tensor, sites: Sites, options: Options, out: Tensor | None = 
     """
     (B, C), V = source.shape[:2], sites.matrix.shape[1]
     channels, (P, h, w) = C + _extras(options), (sites.z.shape[-1], len(sites.y), len(sites.x))
-    if out is None and getattr(options, "stacked", False):
+    if out is None and options.stacked:
         out = source.new_empty((B, V, h, w, channels, P)).permute(0, 1, 4, 5, 2, 3)
     elif out is None:
         out = empty_channels_last(B, V, channels, P, h, w, like=source)

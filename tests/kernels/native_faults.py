@@ -10,7 +10,7 @@ import lsmgeo
 
 SOURCES = Path(lsmgeo.__file__).parent / "kernels" / "native"
 
-# name: (what stands in resample.h, what is put in its place)
+# name: (what stands in the source, what is put in its place)
 FAULTS = {
     "half a pixel": ("const float index = tile.index[axis][s];", "const float index = tile.index[axis][s] + 0.5f;"),
     "x and y swapped": ("tile.index[0][s] = front ? (slope[0]", "tile.index[0][s] = front ? (slope[1]"),
@@ -42,7 +42,7 @@ FAULTS = {
         "rows[2][s] = -(rows[0][s] * tile.index[0][s]",
         "rows[2][s] = -(0.0f * tile.index[0][s]",
     ),
-    "inverse depth's part forgotten": ("by_z[s] -= by_plane * tile.plane[row][s] * tile.depth[s];", ""),
+    "inverse depth's part forgotten": ("by_z[s] -= double(by_plane) * tile.plane[row][s] * tile.depth[s];", ""),
     "direction's slope not projected": (
         "(by_direction[row][s] - along * tile.direction[row][s])",
         "by_direction[row][s]",
@@ -82,13 +82,15 @@ def compiler() -> str | None:
 
 def build(folder: Path, fault: str | None) -> Path:
     """The kernels with one fault, or none, for the plainest instruction set and quickly compiled."""
+    found = 0
     for source in SOURCES.iterdir():
         text = source.read_text(encoding="utf-8")
-        if fault is not None and source.name == "resample.h":
+        if fault is not None:
             there, instead = FAULTS[fault]
-            assert there in text, f"{fault}: the source has changed"
+            found += text.count(there)
             text = text.replace(there, instead)
         (folder / source.name).write_text(text, encoding="utf-8")
+    assert fault is None or found, f"{fault}: the source has changed"
     library = folder / "kernels.so"
     flags = ["-std=c++17", "-O0", "-w", "-fPIC", "-shared", "-DLSMGEO_ONE_SET"]
     subprocess.run([str(compiler()), *flags, "-o", str(library), str(folder / "kernels.cpp")], check=True)

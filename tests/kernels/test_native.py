@@ -266,6 +266,62 @@ def test_nothing_of_the_size_of_all_views_is_kept():
     assert sum(kept) < 4 * features.numel() + 20_000
 
 
+# What has gone wrong once
+
+
+def test_channels_in_parts_where_only_geometry_needs_a_gradient():
+    features = torch.rand(1, 2, 37, 5, 6)
+    pixels, valid = cases.PIXELS[:1, :2], cases.VALID[:1, :2]
+    found = []
+    for backend in ("cpu", "reference"):
+        depth = torch.linspace(0.5, 2.0, 22).reshape(1, 2, 11).requires_grad_()
+        volume, _ = functional.sample_views(
+            features, pixels, depth, valid, augment="depth", reduce="mean", backend=backend
+        )
+        found += torch.autograd.grad(volume.square().sum(), depth)
+    torch.testing.assert_close(*found)
+    assert found[1].abs().max() > 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_the_default_dtype_is_of_no_matter(dtype):
+    call = cases.points_call(cases.FEATURES, cases.VIEWS, cases.POINTS, augment=("depth", "direction"))
+
+    def gradients() -> list[torch.Tensor]:
+        leaves = [leaf.clone().requires_grad_() for leaf in call.leaves]
+        return list(torch.autograd.grad(call.run(*leaves, backend="cpu")[0].square().sum(), leaves))
+
+    expected, before = gradients(), torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        found = gradients()
+    finally:
+        torch.set_default_dtype(before)
+    for part, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-4)
+
+
+def test_no_sites_no_gradient():
+    features = torch.rand(1, 2, 8, 40, 60, requires_grad=True)
+    nowhere = torch.zeros(1, 2, 0, 2), torch.zeros(1, 2, 0), torch.zeros(1, 2, 0, dtype=torch.bool)
+    torch.full(features.shape, 7.0)  # memory that has been written to
+    volume, _ = functional.sample_views(features, *nowhere, backend="cpu")
+    (gradient,) = torch.autograd.grad(volume.sum(), features)
+    torch.testing.assert_close(gradient, torch.zeros_like(features), rtol=0, atol=0)
+
+
+def test_gradients_of_far_planes_are_finite():
+    depths = torch.tensor([1.0, 2.0, 1e20, 1e25, 3e30])
+    found = []
+    for backend in ("cpu", "reference"):
+        leaf = depths.clone().requires_grad_()
+        maps, _ = functional.plane_sweep_project(
+            cases.VOLUME, cases.VIEWS, cases.GRID, leaf, cases.SIZE, augment="depth", backend=backend
+        )
+        found += torch.autograd.grad(maps.sum(), leaf)
+    torch.testing.assert_close(*found, rtol=1e-4, atol=1e-4)
+
+
 # Absence
 
 
@@ -294,6 +350,11 @@ def test_a_file_that_is_no_library_is_a_reason(tmp_path: Path):
     reason = cpu.load(broken)
     assert isinstance(reason, str)
     assert "_native.abi3.so does not load" in reason
+
+
+def test_another_library_is_a_reason():
+    reason = cpu.load(Path(torch.__file__).parent / "lib" / "libtorch_global_deps.so")
+    assert isinstance(reason, str)
 
 
 def test_explain_takes_it(capsys):

@@ -1,0 +1,303 @@
+// Values of blocks of sites, of views and of their statistics. Included by resample.h.
+
+// Blocks of values
+
+struct Layout { int64_t base, site, channel; };
+
+inline Layout layout(const int64_t *stride, const Tile &tile) {
+    const int64_t base = tile.scene * stride[0] + tile.view * stride[1] + tile.k * stride[3] + tile.j * stride[4] +
+                         tile.i * stride[5];
+    return {base, tile.along_z ? stride[3] : stride[5], stride[2]};
+}
+
+template <class S>
+inline void store_block(S *values, const Layout &at, int64_t sites, int64_t channels, const float *block) {
+    S *first = values + at.base;
+    if (at.channel == 1) {
+        for (int64_t s = 0; s < sites; s++)
+            for (int64_t c = 0; c < channels; c++) store(first + s * at.site + c, block[s * channels + c]);
+    } else if (at.site == 1) {
+        for (int64_t c = 0; c < channels; c++)
+            for (int64_t s = 0; s < sites; s++) store(first + c * at.channel + s, block[s * channels + c]);
+    } else {
+        for (int64_t s = 0; s < sites; s++)
+            for (int64_t c = 0; c < channels; c++) store(first + s * at.site + c * at.channel, block[s * channels + c]);
+    }
+}
+
+inline void put(const Call &call, const Layout &at, int64_t sites, int64_t channels, const float *block) {
+    if (call.values_type == FLOAT32 && at.site == 1)
+        transpose(block, channels, static_cast<float *>(call.values) + at.base, at.channel, sites, channels);
+    else if (call.values_type == FLOAT32) store_block(static_cast<float *>(call.values), at, sites, channels, block);
+    else if (call.values_type == BFLOAT16)
+        store_block(static_cast<Bfloat16 *>(call.values), at, sites, channels, block);
+    else store_block(static_cast<Float16 *>(call.values), at, sites, channels, block);
+}
+
+template <class S>
+inline void load_block(const S *values, const Layout &at, int64_t sites, int64_t channels, float *block) {
+    const S *first = values + at.base;
+    if (at.channel == 1)
+        for (int64_t s = 0; s < sites; s++)
+            for (int64_t c = 0; c < channels; c++) block[s * channels + c] = load(first[s * at.site + c]);
+    else
+        for (int64_t c = 0; c < channels; c++)
+            for (int64_t s = 0; s < sites; s++) block[s * channels + c] = load(first[s * at.site + c * at.channel]);
+}
+
+// A block of the incoming gradient: (sites, channels) with a step from site to site, in place where that is possible.
+struct Block { const float *first; int64_t step; };
+
+inline Block take(const Call &call, const Tile &tile, int64_t channel, int64_t channels, float *room) {
+    Layout at = layout(call.gradient_stride, tile);
+    at.base += channel * at.channel;
+    if (call.gradient_type == FLOAT32) {
+        const float *values = static_cast<const float *>(call.gradient);
+        if (at.channel == 1) return {values + at.base, at.site};
+        if (at.site == 1) transpose(values + at.base, at.channel, room, channels, channels, tile.number);
+        else load_block(values, at, tile.number, channels, room);
+    } else if (call.gradient_type == BFLOAT16) {
+        load_block(static_cast<const Bfloat16 *>(call.gradient), at, tile.number, channels, room);
+    } else {
+        load_block(static_cast<const Float16 *>(call.gradient), at, tile.number, channels, room);
+    }
+    return {room, channels};
+}
+
+inline void show(const Call &call, const Tile &tile) {
+    const int64_t *n = call.sites;
+    const int64_t at = (((tile.scene * call.views + tile.view) * n[2] + tile.k) * n[1] + tile.j) * n[0] + tile.i;
+    const int64_t step = tile.along_z ? n[0] * n[1] : 1;
+    for (int64_t s = 0; s < tile.number; s++) call.visible[at + s * step] = tile.visible[s];
+}
+
+// The channels that geometry gives: depth, direction, extras; `step` floats from one to the next.
+inline void append(const Call &call, const Tile &tile, int s, float *out) {
+    if (call.depth) *out++ = tile.distance[s];
+    if (call.direction)
+        for (int row = 0; row < 3; row++) *out++ = tile.direction[row][s];
+    if (call.extra) {
+        const int64_t site = (tile.scene * call.views + tile.view) * call.sites[0] + tile.i + s;
+        std::memcpy(out, call.extras + site * call.extra, size_t(call.extra) * sizeof(float));
+    }
+}
+
+inline const View &view_of(const Plan &plan, const Tile &tile) {
+    return plan.views[tile.scene * plan.call->views + tile.view];
+}
+
+inline void start(const Plan &plan, Tile &tile, int64_t scene, int64_t view, int64_t number) {
+    const Call &call = *plan.call;
+    const int64_t row = number / plan.tiles_per_row, part = number % plan.tiles_per_row;
+    const int64_t length = plan.along_z ? call.sites[2] : call.sites[0];
+    const int64_t first = part * length / plan.tiles_per_row, last = (part + 1) * length / plan.tiles_per_row;
+    tile.scene = scene;
+    tile.view = view;
+    tile.number = last - first;
+    tile.along_z = plan.along_z;
+    tile.k = plan.along_z ? first : row / call.sites[1];
+    tile.j = plan.along_z ? row / call.sites[0] : row % call.sites[1];
+    tile.i = plan.along_z ? row % call.sites[0] : first;
+}
+
+template <class S>
+inline const S *source_of(const Call &call, int64_t scene, int64_t view) {
+    return static_cast<const S *>(call.source) + scene * call.source_stride[0] + view * call.source_stride[1];
+}
+
+inline float *gradient_of(const Call &call, int64_t scene, int64_t view) {
+    return call.source_gradient + scene * call.source_gradient_stride[0] + view * call.source_gradient_stride[1];
+}
+
+inline void axis_strides(const int64_t *stride, int64_t *axes) {  // to the order x, y, z
+    axes[0] = stride[4];
+    axes[1] = stride[3];
+    axes[2] = stride[2];
+}
+
+// Whether no site of a tile in a volume's lattice reads anything, seen from its two ends: indices change along a tile
+// in one direction. Much of a sweep lies beside the volume. Nothing is lost by a "no"; the margin is beyond rounding.
+inline bool is_beside(const Call &call, const View &view, const Tile &tile) {
+    if (call.kind != VOLUMES) return false;
+    if (view.masked) return true;
+    if (call.border) return false;
+    const int64_t last = tile.number - 1;
+    double index[3][2];
+    for (int end = 0; end < 2; end++) {
+        const double x = call.x[tile.i + (tile.along_z ? 0 : end * last)], y = call.y[tile.j];
+        const double depth = 1.0 / plane_z(call, tile, tile.k + (tile.along_z ? end * last : 0));
+        for (int row = 0; row < 3; row++) {
+            const double *m = view.matrix[row];
+            index[row][end] = (m[0] * x + m[1] * y + m[3]) * depth + m[2];
+        }
+    }
+    for (int axis = 0; axis < 3; axis++) {
+        const double high = double(call.size[axis]) + 0.01;
+        if (index[axis][0] < -1.01 && index[axis][1] < -1.01) return true;
+        if (index[axis][0] > high && index[axis][1] > high) return true;
+    }
+    return false;
+}
+
+// Zeros for a whole tile that nobody sees.
+inline void blank(const Call &call, Tile &tile, const Layout &at) {
+    for (int64_t s = 0; s < tile.number; s++) tile.visible[s] = 0;
+    show(call, tile);
+    float *out = static_cast<float *>(call.values) + at.base;
+    if (at.channel == 1 && at.site == call.channels) {
+        std::memset(out, 0, size_t(tile.number * call.channels) * sizeof(float));
+    } else if (at.site == 1) {
+        for (int64_t c = 0; c < call.channels; c++)
+            std::memset(out + c * at.channel, 0, size_t(tile.number) * sizeof(float));
+    } else {
+        for (int64_t s = 0; s < tile.number; s++)
+            for (int64_t c = 0; c < call.channels; c++) out[s * at.site + c * at.channel] = 0.0f;
+    }
+}
+
+// Forward, every view by itself: tiles first to last of one view.
+template <int DIMS, class S>
+void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_t last, Room &room) {
+    const Call &call = *plan.call;
+    Tile &tile = *static_cast<Tile *>(room.tiles);
+    int64_t axes[3];
+    axis_strides(call.source_stride, axes);
+    const S *source = source_of<S>(call, scene, view);
+    const int64_t channels = plan.channels;
+    for (int64_t number = first; number < last; number++) {
+        start(plan, tile, scene, view, number);
+        const Layout at = layout(call.values_stride, tile);
+        if (channels == call.channels && call.values_type == FLOAT32 && is_beside(call, view_of(plan, tile), tile)) {
+            blank(call, tile, at);
+            continue;
+        }
+        locate<DIMS>(call, view_of(plan, tile), tile);
+        show(call, tile);
+        const bool direct = call.values_type == FLOAT32 && at.channel == 1;
+        float *out = direct ? static_cast<float *>(call.values) + at.base : room.values;
+        const int64_t step = direct ? at.site : channels;
+        for (int s = 0; s < int(tile.number); s++) {
+            gather<DIMS>(call, tile, s, source, axes, call.channels, out + s * step);
+            append(call, tile, s, out + s * step + call.channels);
+        }
+        if (!direct) put(call, at, tile.number, channels, room.values);
+    }
+}
+
+// Statistics of one site
+
+// The values of the views that see site s, one after another in room.values; returns how many, and who they are.
+template <class S>
+inline int64_t visible_values(const Plan &plan, const Tile *tiles, int s, int64_t channel, int64_t channels,
+                              bool geometry, Room &room) {
+    const Call &call = *plan.call;
+    const int64_t step = channels + (geometry ? plan.channels - call.channels : 0);
+    int64_t axes[3], count = 0;
+    axis_strides(call.source_stride, axes);
+    for (int64_t v = 0; v < call.views; v++) {
+        if (!tiles[v].visible[s]) continue;
+        float *out = room.values + count * step;
+        const S *source = source_of<S>(call, tiles[v].scene, v) + channel;
+        gather<2>(call, tiles[v], s, source, axes, channels, out);
+        if (geometry) append(call, tiles[v], s, out + channels);
+        room.seen[count++] = v;
+    }
+    return count;
+}
+
+constexpr float LARGEST_ROOT = 0x1.fffffep63f;  // the square root of the largest float
+
+template <int W> INLINE Floats<W> held_lanes(Floats<W> values, float largest) {
+    const Floats<W> below = values > largest ? Floats<W>{} + largest : values;
+    return below < -largest ? Floats<W>{} - largest : below;
+}
+
+template <int W> INLINE Floats<W> mean_of(const float *values, int64_t count, int64_t step) {
+    const float share = 1.0f / float(count);
+    Floats<W> mean = {};
+    for (int64_t v = 0; v < count; v++) mean += read<W>(values + v * step) * share;
+    return mean;
+}
+
+// The first of the views that has the largest value, a NaN above all, and that value.
+template <int W> INLINE Masks<W> best_of(const float *values, int64_t count, int64_t step, Floats<W> &best) {
+    best = read<W>(values);
+    Masks<W> first = {};
+    for (int64_t v = 1; v < count; v++) {
+        const Floats<W> value = read<W>(values + v * step);
+        const Masks<W> stays = (value <= best) | (best != best);
+        best = stays ? best : value;
+        first = stays ? first : Masks<W>{} + int32_t(v);
+    }
+    return first;
+}
+
+// Statistics of `count` rows of values, one block of channels after another.
+inline void summarise(const Call &call, const float *values, int64_t count, int64_t channels, float *out) {
+    if (count == 0) {
+        std::memset(out, 0, size_t(call.statistics * channels) * sizeof(float));
+        return;
+    }
+    const float share = 1.0f / float(count);
+    over_channels(channels, [&](auto width, int64_t c) INLINED {
+        constexpr int W = decltype(width)::value;
+        const float *first = values + c;
+        for (int64_t block = 0; block < call.statistics; block++) {
+            Floats<W> result = {};
+            if (call.statistic[block] == MAX) {
+                best_of<W>(first, count, channels, result);
+            } else {
+                result = mean_of<W>(first, count, channels);
+                if (call.statistic[block] == VARIANCE) {
+                    const Floats<W> mean = result;
+                    result = Floats<W>{};
+                    for (int64_t v = 0; v < count; v++) {
+                        const Floats<W> apart = held_lanes<W>(read<W>(first + v * channels) - mean, LARGEST_ROOT);
+                        result += apart * apart * share;
+                    }
+                    result = held_lanes<W>(result, LARGEST);
+                }
+            }
+            write<W>(out + block * channels + c, result);
+        }
+    });
+}
+
+// Forward with the views reduced: tiles first to last of one scene.
+template <class S>
+void reduce(const Plan &plan, int64_t scene, int64_t first, int64_t last, Room &room) {
+    const Call &call = *plan.call;
+    Tile *tiles = static_cast<Tile *>(room.tiles);
+    const int64_t channels = plan.channels, total = call.statistics * channels;
+    const bool only_mean = call.statistics == 1 && call.statistic[0] == MEAN && channels == call.channels;
+    int64_t axes[3];
+    axis_strides(call.source_stride, axes);
+    for (int64_t number = first; number < last; number++) {
+        for (int64_t v = 0; v < call.views; v++) {
+            start(plan, tiles[v], scene, v, number);
+            locate<2>(call, view_of(plan, tiles[v]), tiles[v]);
+            show(call, tiles[v]);
+        }
+        const Layout at = layout(call.values_stride, tiles[0]);
+        const bool direct = call.values_type == FLOAT32 && at.channel == 1;
+        for (int s = 0; s < int(tiles[0].number); s++) {
+            float *out = direct ? static_cast<float *>(call.values) + at.base + s * at.site : room.reduced + s * total;
+            if (only_mean) {
+                int64_t count = 0;
+                for (int64_t v = 0; v < call.views; v++) count += tiles[v].visible[s];
+                bool add = false;
+                for (int64_t v = 0; v < call.views; v++) {
+                    if (!tiles[v].visible[s]) continue;
+                    const S *source = source_of<S>(call, scene, v);
+                    gather<2>(call, tiles[v], s, source, axes, channels, out, 1.0f / float(count), add);
+                    add = true;
+                }
+                if (!add) std::memset(out, 0, size_t(channels) * sizeof(float));
+                continue;
+            }
+            const int64_t count = visible_values<S>(plan, tiles, s, 0, call.channels, true, room);
+            summarise(call, room.values, count, channels, out);
+        }
+        if (!direct) put(call, at, tiles[0].number, total, room.reduced);
+    }
+}

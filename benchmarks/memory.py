@@ -121,8 +121,10 @@ def measure(problem: Problem, name: str, kind: str, threads: int = 2, limit: flo
     except EOFError:
         return {"left_out": "ended early, most likely out of memory"}
     finally:
-        process.terminate()
-        process.join()
+        process.join(10)
+        if process.is_alive():
+            process.terminate()
+            process.join()
         receiver.close()
 
 

@@ -256,13 +256,43 @@ def _together(parts: Sequence[Tensor | None]) -> list[Tensor | None]:
     return [None if part is None else part.sum(2) for part in parts]
 
 
+def _lattice(kind: int, source: Tensor, sites: Sites, options: Options) -> tuple[_Call, tuple[Tensor | None, ...]]:
+    """A call on the sites of a lattice, and what must live as long as it."""
+    source = _channels_last(source, _channel_axis(kind))
+    call = _start(kind, source, options, (sites.x.shape[0], sites.y.shape[0], sites.z.shape[-1]))
+    return call, (source, *_place(call, sites, options))
+
+
+def _channel_axis(kind: int) -> int:
+    return 1 if kind == VOLUMES else 2
+
+
+def _lattice_backward(
+    kind: int,
+    gradient: Tensor,
+    source: Tensor,
+    sites: Sites,
+    options: Options,
+    needs: Sequence[bool],
+    into: Tensor | None,
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+    call, kept = _lattice(kind, source, sites, options)
+    strides = gradient.stride()
+    _gradient(call, gradient, (strides[0], 0, *strides[1:]) if options.reduce else strides)
+    to_source = _source_gradient(call, source, _channel_axis(kind), into) if needs[0] else None
+    parts = _geometry_gradients(call, (needs[1], needs[2] and bool(options.direction), needs[3]))
+    _run(call, backward=True)
+    del kept
+    if to_source is not None and into is None:
+        to_source = saturating_cast(to_source, source.dtype)
+    return to_source, *_together(parts)  # type: ignore[return-value]
+
+
 def images(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """`reference.unproject`; `out` is memory of the answer's shape to write to."""
-    source = _channels_last(source, 2)
     B, V, C = source.shape[:3]
-    counts = (sites.z.shape[-1], sites.y.shape[0], sites.x.shape[0])
-    call = _start(IMAGES, source, options, counts[::-1])
-    kept = _place(call, sites, options)
+    call, kept = _lattice(IMAGES, source, sites, options)
+    counts = call.sites[::-1]
     channels = C + call.depth + 3 * call.direction
     if options.reduce:
         values = (
@@ -301,19 +331,7 @@ def images_backward(
         Gradients, None where not asked for: of source in its dtype, of matrices (B, V, 3, 4) and of z (B, V, D) in
         float64.
     """
-    original, source = source, _channels_last(source, 2)
-    counts = (sites.z.shape[-1], sites.y.shape[0], sites.x.shape[0])
-    call = _start(IMAGES, source, options, counts[::-1])
-    kept = _place(call, sites, options)
-    strides = gradient.stride()
-    _gradient(call, gradient, (strides[0], 0, *strides[1:]) if options.reduce else strides)
-    to_source = _source_gradient(call, source, 2, into) if needs[0] else None
-    parts = _geometry_gradients(call, (needs[1], needs[2] and bool(options.direction), needs[3]))
-    _run(call, backward=True)
-    del kept
-    if to_source is not None and into is None:
-        to_source = saturating_cast(to_source, original.dtype)
-    return to_source, *_together(parts)  # type: ignore[return-value]
+    return _lattice_backward(IMAGES, gradient, source, sites, options, needs, into)
 
 
 def pixels(
@@ -384,10 +402,8 @@ def pixels_backward(
 
 def volume(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """`reference.plane_sweep_project`; `out` is memory of the answer's shape, any strides, to write to."""
-    source = _channels_last(source, 1)
-    counts = (sites.z.shape[-1], sites.y.shape[0], sites.x.shape[0])
-    call = _start(VOLUMES, source, options, counts[::-1])
-    kept = _place(call, sites, options)
+    call, kept = _lattice(VOLUMES, source, sites, options)
+    counts = call.sites[::-1]
     shape = (call.scenes, call.views, source.shape[1] + call.depth + 3 * call.direction, *counts)
     if out is None:
         out = fresh(shape, source.dtype, (0, 1, 4, 5, 2, 3) if options.stacked else (0, 1, 3, 4, 5, 2))
@@ -407,15 +423,4 @@ def volume_backward(
     into: Tensor | None = None,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
     """Vector-Jacobian product of `volume`, as `images_backward`."""
-    original, source = source, _channels_last(source, 1)
-    counts = (sites.z.shape[-1], sites.y.shape[0], sites.x.shape[0])
-    call = _start(VOLUMES, source, options, counts[::-1])
-    kept = _place(call, sites, options)
-    _gradient(call, gradient, gradient.stride())
-    to_source = _source_gradient(call, source, 1, into) if needs[0] else None
-    parts = _geometry_gradients(call, (needs[1], needs[2] and bool(options.direction), needs[3]))
-    _run(call, backward=True)
-    del kept
-    if to_source is not None and into is None:
-        to_source = saturating_cast(to_source, original.dtype)
-    return to_source, *_together(parts)  # type: ignore[return-value]
+    return _lattice_backward(VOLUMES, gradient, source, sites, options, needs, into)

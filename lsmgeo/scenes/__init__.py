@@ -1,18 +1,28 @@
 """Analytic scenes: exact ray hits, depth, normals, silhouettes and occupancy of solids and their unions."""
 
+from lsmgeo.scenes.inside import occupancy, voxels
 from lsmgeo.scenes.lighting import Lights, shade
+from lsmgeo.scenes.rendering import Hits, Rendering, render, trace
 from lsmgeo.scenes.solids import Kind, Material, Solid, box, cone, cylinder, ellipsoid, half_space, sphere
+from lsmgeo.scenes.tables import Scene
 
 __all__ = [
+    "Hits",
     "Kind",
     "Lights",
     "Material",
+    "Rendering",
+    "Scene",
     "Solid",
     "box",
     "cone",
     "cylinder",
     "ellipsoid",
     "half_space",
+    "occupancy",
+    "render",
     "shade",
     "sphere",
+    "trace",
+    "voxels",
 ]

@@ -101,8 +101,7 @@ class Solid:
         return self.transformed(np.c_[np.eye(3), np.asarray(offset, dtype=np.float64)])
 
     def rotated(self, axis: int, degrees: float, center: Vector = (0.0, 0.0, 0.0)) -> Solid:
-        """The solid turned about a coordinate axis (0, 1, 2 for x, y, z) through ``center``, counterclockwise when
-        the axis points at the viewer."""
+        """The solid turned about a line through ``center`` along x, y or z (``axis`` 0, 1, 2), right-handed."""
         turn = rotation(axis, degrees)
         center = np.asarray(center, dtype=np.float64)
         return self.transformed(np.c_[turn, center - turn @ center])
@@ -189,9 +188,8 @@ def half_space(point: Vector, normal: Vector, material: Material | None = None) 
     As a part it is a floor or a wall; cut out of a solid, it clips.
     """
     normal = np.asarray(normal, dtype=np.float64)
-    return _placed(
-        Kind.HALF_SPACE, _frame("half_space", "normal", normal / _length("half_space", normal)), point, material
-    )
+    frame = _frame("half_space", "normal", normal / _length("half_space", normal))
+    return _placed(Kind.HALF_SPACE, frame, point, material)
 
 
 def _round(

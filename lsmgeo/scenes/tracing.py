@@ -1,0 +1,270 @@
+"""First hits of rays with scenes: which solid's surface, and where.
+
+Every solid, and every cut, gives one interval of the ray; a cut moves the start of its solid's interval to its own end.
+The nearest start wins. A view alone visits each solid within the pixels that can show it; many views together visit
+their solids of one kind at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from lsmgeo._linalg import inverse_3x3, multiply, transform
+from lsmgeo.cameras.matrices import CameraMatrices
+from lsmgeo.scenes.intervals import interval
+from lsmgeo.scenes.solids import Kind
+from lsmgeo.scenes.tables import Placed, Scene, Tables, layout
+
+__all__ = ["CameraRays", "FreeRays", "Plan", "first_hits", "make_plan"]
+
+Window = tuple[slice, slice]
+EVERYTHING = (slice(None), slice(None))
+
+
+class Visit(NamedTuple):
+    """Solids of one kind that are intersected together, at most one of a view."""
+
+    kind: Kind
+    rows: list[int]  # (M,) rows of the plan's tables, one for each view of `views`
+    views: list[int]  # (M,)
+    cuts: list[tuple[Kind, list[int], list[int]]]  # of each cut: kind, which of the M have it, their rows
+
+    def pairs(self) -> list[tuple[int, int]]:
+        """(row, view) of all that is intersected."""
+        cut = [
+            (row, self.views[member]) for _, which, rows in self.cuts for member, row in zip(which, rows, strict=True)
+        ]
+        return list(zip(self.rows, self.views, strict=True)) + cut
+
+
+class Plan(NamedTuple):
+    """The solids of V views of scenes. A row of the tables is one solid, or cut, of one scene."""
+
+    tables: Tables
+    visits: list[Visit]
+
+
+class Rays(Protocol):
+    """Rays of V views, in an (H, W) arrangement."""
+
+    def local(self, rows: list[int], views: list[int], window: Window) -> tuple[Tensor, Tensor, Tensor]:
+        """Local points and directions (M, 3, h, w) of a window's rays, and the ray parameter of the points."""
+
+    def window(self, row: int, view: int) -> Window | None:
+        """Where a solid can be hit; None if nowhere."""
+
+
+def make_plan(scenes: Sequence[Scene], owner: Sequence[int], device: torch.device) -> Plan:
+    """Lay out which solids are intersected with which views, and in what company.
+
+    Args:
+        scenes: S scenes.
+        owner: (V,) which scene each view shows.
+        device: for the tables, which stay float64.
+    """
+    rows_of, placed = layout(scenes)
+    # The first solid of a kind in every view, then the second, and so on.
+    grouped: dict[tuple[Kind, int], list[tuple[int, Placed]]] = {}
+    for view, scene_index in enumerate(owner):
+        seen: dict[Kind, int] = {}
+        for entry in placed[scene_index]:
+            seen[entry.kind] = seen.get(entry.kind, 0) + 1
+            grouped.setdefault((entry.kind, seen[entry.kind]), []).append((view, entry))
+
+    visits = []
+    for (kind, _), members in grouped.items():
+        # Cuts of the same kind and place in their solid's list go together.
+        cut: dict[tuple[int, Kind], tuple[list[int], list[int]]] = {}
+        for member, (_, entry) in enumerate(members):
+            for place, (cut_kind, row) in enumerate(entry.cuts):
+                which, rows = cut.setdefault((place, cut_kind), ([], []))
+                which.append(member)
+                rows.append(row)
+        rows, views = [entry.row for _, entry in members], [view for view, _ in members]
+        visits.append(Visit(kind, rows, views, [(kind, *both) for (_, kind), both in cut.items()]))
+    return Plan(rows_of.to(device, torch.float64), visits)
+
+
+class CameraRays:
+    """The rays through the pixel centres of V cameras, parametrised by depth.
+
+    The local point of pixel (u, v) at depth t is affine in u and in v: one row and one column of numbers a solid, taken
+    where the solid's centre is, so that nothing large cancels.
+
+    Args:
+        plan: of the V views.
+        cameras: float64 matrices of the V cameras, for images of this size.
+        size: (H, W).
+        near: nothing nearer is seen.
+        dtype: of the arithmetic.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        cameras: CameraMatrices,
+        size: tuple[int, int],
+        *,
+        near: float,
+        dtype: torch.dtype,
+    ) -> None:
+        pairs = [pair for visit in plan.visits for pair in visit.pairs()]
+        self.index = {pair: place for place, pair in enumerate(pairs)}
+        device = cameras.intrinsics.device
+        rows, views = torch.tensor(pairs, device=device).unbind(1)
+        self.center = cameras.center
+        self.from_pixel = multiply(cameras.rotation.transpose(1, 2), inverse_3x3(cameras.intrinsics))
+        solids = plan.tables
+        linear, offset = solids.linear[rows], cameras.center[views] - solids.center[rows]
+        depth = (-(offset * cameras.rotation[views, 2]).sum(-1)).clamp_min(near)
+        direction = multiply(linear, self.from_pixel[views])  # (P, 3, 3): applied to (u, v, 1)
+        point = direction * depth[:, None, None]
+        point[:, :, 2] += transform(linear, offset)
+        v, u = (torch.arange(count, dtype=torch.float64, device=device) for count in size)
+
+        def separate(matrix: Tensor) -> tuple[Tensor, Tensor]:
+            across = matrix[:, :, :1] * u
+            down = matrix[:, :, 1:2] * v + matrix[:, :, 2:]
+            return across[:, :, None, :].to(dtype), down[:, :, :, None].to(dtype)  # (P, 3, 1, W), (P, 3, H, 1)
+
+        self.points, self.directions = separate(point), separate(direction)
+        self.depth = depth[:, None, None].to(dtype)
+        # A view alone need not look at pixels that a solid cannot reach.
+        alone = len(cameras.center) == 1
+        self.windows = _windows(solids, rows, cameras, views, size, near) if alone else None
+
+    def local(self, rows: list[int], views: list[int], window: Window) -> tuple[Tensor, Tensor, Tensor]:
+        """As `Rays.local`."""
+        where = [self.index[pair] for pair in zip(rows, views, strict=True)]
+        which = slice(where[0], where[0] + 1) if len(where) == 1 else where
+        v, u = window
+        point = self.points[0][which][..., u] + self.points[1][which][..., v, :]
+        direction = self.directions[0][which][..., u] + self.directions[1][which][..., v, :]
+        return point, direction, self.depth[which]
+
+    def window(self, row: int, view: int) -> Window | None:
+        """As `Rays.window`."""
+        if self.windows is None:
+            return EVERYTHING
+        top, bottom, left, right = self.windows[self.index[row, view]]
+        return (slice(top, bottom), slice(left, right)) if top < bottom and left < right else None
+
+
+def _windows(
+    solids: Tables, rows: Tensor, cameras: CameraMatrices, views: Tensor, size: tuple[int, int], near: float
+) -> list[list[int]]:
+    """First and last + 1 row and column of the pixels that can show a solid, from the corners of its box."""
+    corners = torch.cartesian_prod(*[rows.new_tensor([-1.0, 1.0], dtype=torch.float64)] * 3)  # (8, 3)
+    world = transform(solids.axes[rows, None], corners) + solids.center[rows, None]  # (P, 8, 3)
+    rotation, center = cameras.rotation[views, None], cameras.center[views, None]
+    seen = transform(rotation, world - center)
+    depth = seen[..., 2]
+    pixel = transform(cameras.intrinsics[views, None], seen)[..., :2] / depth.clamp_min(near)[..., None]
+    limit = pixel.new_tensor([size[1], size[0]])
+    # One pixel of margin for rounding; what reaches behind the near plane may be anywhere.
+    first = (pixel.amin(1).floor() - 1).clamp_min(0).minimum(limit)
+    last = (pixel.amax(1).ceil() + 2).clamp_min(0).minimum(limit)
+    bounded = [kind is not Kind.HALF_SPACE for kind in solids.kinds]
+    whole = ~(rows.new_tensor(bounded, dtype=torch.bool)[rows] & (depth > near).all(1))[:, None]
+    first, last = torch.where(whole, 0.0, first).long(), torch.where(whole, limit, last).long()
+    return torch.stack((first[:, 1], last[:, 1], first[:, 0], last[:, 0]), 1).tolist()
+
+
+class FreeRays:
+    """Rays from any point in any direction, parametrised by multiples of the direction.
+
+    Args:
+        plan: of V views; its tables in the rays' dtype.
+        origins: (V, 3, H, W).
+        directions: (V, 3, H, W), any length above 0.
+    """
+
+    def __init__(self, plan: Plan, origins: Tensor, directions: Tensor) -> None:
+        self.solids, self.origins, self.directions = plan.tables, origins, directions
+        self.squared_length = directions.square().sum(1)
+
+    def local(self, rows: list[int], views: list[int], window: Window) -> tuple[Tensor, Tensor, Tensor]:
+        """As `Rays.local`; the window is all rays."""
+        linear, center = self.solids.linear[rows], self.solids.center[rows]
+        direction = self.directions[views]
+        offset = self.origins[views] - center[:, :, None, None]
+        # From the point nearest to the solid's centre, so that nothing large cancels.
+        along = -(offset * direction).sum(1) / self.squared_length[views]  # (M, H, W)
+        point = offset + along[:, None] * direction
+        return _apply(linear, point), _apply(linear, direction), along
+
+    def window(self, row: int, view: int) -> Window | None:
+        """All rays."""
+        return EVERYTHING
+
+
+def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """(M, 3, 3) applied to (M, 3, H, W), elementwise: exact under autocast and TF32."""
+    columns = matrices[:, :, :, None, None].unbind(2)
+    x, y, z = vectors[:, None].unbind(2)
+    return columns[0] * x + columns[1] * y + columns[2] * z
+
+
+def first_hits(plan: Plan, rays: Rays, shape: tuple[int, int, int], near: float, like: Tensor) -> tuple[Tensor, Tensor]:
+    """The nearest surface that each ray enters beyond ``near``.
+
+    A solid that holds the point at ``near`` is not seen from within, unless that point lies in one of its cuts.
+
+    Args:
+        plan: of V views.
+        rays: of the V views.
+        shape: (V, H, W).
+        near: smallest ray parameter.
+        like: its dtype and device.
+
+    Returns:
+        ray parameter (V, H, W), infinite where nothing is hit; row of the plan's tables (V, H, W) int32, -1 there.
+    """
+    nearest = like.new_full(shape, torch.inf)
+    surface = torch.full(shape, -1, dtype=torch.int32, device=like.device)
+    for visit in plan.visits:
+        window = rays.window(visit.rows[0], visit.views[0])
+        if window is None:
+            continue
+        start, end, who = _enter(plan.tables, visit, rays, window, near, like.dtype)
+        closer = (start < end) & (start > near)
+        which = (slice(None) if len(visit.views) == shape[0] else visit.views, *window)
+        before = nearest[which]
+        closer &= start < before
+        nearest[which] = torch.where(closer, start, before)
+        surface[which] = torch.where(closer, who, surface[which])
+    return nearest, surface
+
+
+def _enter(
+    solids: Tables, visit: Visit, rays: Rays, window: Window, near: float, dtype: torch.dtype
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Start and end of the rays' first stretch inside solids less their cuts, and the row whose surface begins it."""
+
+    def intervals(kind: Kind, rows: list[int], views: list[int]) -> tuple[Tensor, Tensor]:
+        point, direction, at = rays.local(rows, views, window)
+        taper = solids.taper[rows, None, None].to(dtype) if kind is Kind.CONE else 1.0
+        start, end = interval(kind, point, direction, taper)
+        return start + at, end + at
+
+    start, end = intervals(visit.kind, visit.rows, visit.views)
+    who = torch.tensor(visit.rows, dtype=torch.int32, device=start.device)[:, None, None]
+    if not visit.cuts:
+        return start, end, who
+    start = start.clamp_min(near)
+    who = who.expand(start.shape).clone()
+    gone = []
+    for kind, which, rows in visit.cuts:
+        row = torch.tensor(rows, dtype=torch.int32, device=start.device)[:, None, None]
+        gone.append((which, row, *intervals(kind, rows, [visit.views[member] for member in which])))
+    # A cut may lead into another: as many rounds as there are cuts settle it.
+    for _ in gone:
+        for which, row, from_here, to_here in gone:
+            inside = (from_here <= start[which]) & (start[which] < to_here)
+            start[which] = torch.where(inside, to_here, start[which])
+            who[which] = torch.where(inside, row, who[which])
+    return start, end, who

@@ -12,7 +12,7 @@ import os
 import tempfile
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MAX_PIXELS",
+    "AtomicFile",
+    "atomic_file",
     "child",
     "image_size",
     "parse_floats",
@@ -190,37 +192,96 @@ def _open_image(path: Path, max_pixels: int) -> Iterator[Image.Image]:
         raise DataError(path, f"is not a readable PNG or JPEG picture ({error})") from error
 
 
-def write_atomic(path: str | os.PathLike[str], content: bytes) -> Path:
-    """Write a file so that it is either wholly there or not at all.
+class AtomicFile:
+    """A file being written by `atomic_file`: bytes go in, and only whole does it take its place."""
 
-    The bytes go to a temporary file beside the target, reach the disk, and replace the target in one step; parents
-    are created.
+    def __init__(self, path: Path, stream: BinaryIO) -> None:
+        self.path = path
+        self._stream = stream
+
+    def write(self, content: bytes) -> int:
+        """Append bytes.
+
+        Raises:
+            DataError: the disk is full, and the like.
+        """
+        try:
+            return self._stream.write(content)
+        except OSError as error:
+            raise DataError(self.path, f"cannot be written ({error})") from error
+
+    def fileno(self) -> int:
+        """The descriptor of the temporary file."""
+        return self._stream.fileno()
+
+
+@contextlib.contextmanager
+def atomic_file(path: str | os.PathLike[str]) -> Iterator[AtomicFile]:
+    """Write a file piece by piece so that it is either wholly there or not at all.
+
+    The bytes go to a temporary file beside the target, reach the disk, and replace the target in one step when the
+    block ends; parents are created. If the block raises, the target stays as it was and nothing half-written stays.
+
+    Args:
+        path: the file to write.
+
+    Yields:
+        The file, with ``write(bytes)``.
+
+    Raises:
+        DataError: the folder or the file cannot be written. Errors of the block itself pass unchanged.
+    """
+    path = Path(path)
+    temporary = stream = None
+    try:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+            temporary = Path(name)
+            stream = os.fdopen(descriptor, "wb")
+        except OSError as error:
+            raise DataError(path, f"cannot be written ({error})") from error
+        yield AtomicFile(path, stream)
+        try:
+            stream.flush()
+            os.fsync(stream.fileno())
+            stream.close()
+            # mkstemp makes a private file; a result should have the permissions that the user's umask gives.
+            umask = os.umask(0)
+            os.umask(umask)
+            temporary.chmod(0o666 & ~umask)
+            temporary.replace(path)
+            temporary = None
+            _sync_folder(path.parent)
+        except OSError as error:
+            raise DataError(path, f"cannot be written ({error})") from error
+    finally:
+        if stream is not None:
+            with contextlib.suppress(OSError):  # a full disk refuses the rest once more
+                stream.close()
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Bring a folder's entries to the disk, where the system can: a rename is not kept before that."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def write_atomic(path: str | os.PathLike[str], content: bytes) -> Path:
+    """Write a file so that it is either wholly there or not at all, as `atomic_file` does.
 
     Raises:
         DataError: the folder or the file cannot be written; nothing half-written stays.
     """
-    path = Path(path)
-    temporary = None
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-        temporary = Path(name)
-        with os.fdopen(descriptor, "wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        # mkstemp makes a private file; a result should have the permissions that the user's umask gives.
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        temporary.replace(path)
-        temporary = None
-    except OSError as error:
-        raise DataError(path, f"cannot be written ({error})") from error
-    finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
-    return path
+    with atomic_file(path) as stream:
+        stream.write(content)
+    return Path(path)
 
 
 def write_point_cloud(path: str | os.PathLike[str], positions: np.ndarray, colours: np.ndarray) -> Path:

@@ -1,0 +1,164 @@
+"""The json of a shape in a shard: what it is, how its views were taken."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+
+from lsmgeo._checks import describe
+from lsmgeo.cameras import CameraTensors
+from lsmgeo.cameras.tensors import check_cameras
+from lsmgeo.errors import DataError, LsmGeoError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from os import PathLike
+
+__all__ = ["MAX_SIDE", "MAX_VIEWS", "MAX_VOXELS", "Metadata", "decode_metadata", "is_text"]
+
+MAX_VIEWS = 1000
+MAX_VOXELS = 256
+MAX_SIDE = 4096
+MAX_BYTES = 1 << 22
+
+
+class Metadata(NamedTuple):
+    """What the json of a shape says, checked.
+
+    Attributes:
+        name, category, split, source, mesh: as in `Sample`; the set it belongs to, where it came from.
+        seed: what it was made from, or None.
+        size: (height, width) of its pictures.
+        depth_step: world units of one step of the depth pictures, or None where there are none.
+        intrinsics: (V, 3, 3) float64.
+        cam_from_world: (V, 4, 4) float64.
+        voxels: the resolutions of its occupancy grids.
+    """
+
+    name: str
+    category: str | None
+    split: str | None
+    source: str | None
+    mesh: str | None
+    seed: int | None
+    size: tuple[int, int]
+    depth_step: float | None
+    intrinsics: np.ndarray
+    cam_from_world: np.ndarray
+    voxels: tuple[int, ...]
+
+    def cameras(self, views: Sequence[int]) -> CameraTensors:
+        """The cameras of these views, float32, leading shape (len(views),), sizes as tensors."""
+        chosen = list(views)
+        K, E = (torch.from_numpy(m[chosen].astype(np.float32)) for m in (self.intrinsics, self.cam_from_world))
+        return CameraTensors(K, E, *(torch.full((len(chosen),), side) for side in self.size))
+
+
+def is_text(value: Any) -> bool:
+    """Whether a value is one line of text, neither empty nor beyond 1024 characters."""
+    return isinstance(value, str) and value.isprintable() and 0 < len(value) <= 1024
+
+
+def decode_metadata(content: bytes, key: str, path: str | PathLike[str]) -> Metadata:
+    """Read and check the json of a shape.
+
+    Args:
+        content: the member's bytes, from outside.
+        key: the shape's key.
+        path: the shard, for errors.
+
+    Raises:
+        DataError: not such a json, or values that make no sense.
+    """
+    where = f"{key}.json"
+    if len(content) > MAX_BYTES:
+        raise DataError(path, f"{where} is larger than the limit of {MAX_BYTES} bytes")
+    try:
+        # int() of a long text is refused by Python itself; deep nesting ends in a RecursionError.
+        values = json.loads(content.decode("utf-8"), parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise DataError(path, f"{where} is not JSON ({error})") from error
+    try:
+        return _metadata(values, key)
+    except (KeyError, TypeError, ValueError, OverflowError, LsmGeoError) as error:
+        reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise DataError(path, f"{where}: {reason}") from error
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"holds {name}")
+
+
+def _metadata(values: Any, key: str) -> Metadata:
+    if not isinstance(values, dict):
+        raise ValueError("expected an object")
+    if values["key"] != key:
+        raise ValueError(f"belongs to key {describe(values['key'])}")
+    texts = {}
+    for field in ("name", "category", "split", "source", "mesh"):
+        text = values[field]
+        if text is not None and not is_text(text):
+            raise ValueError(f"{field} must be 1 to 1024 printable characters or null; got {describe(text)}")
+        texts[field] = text
+    name = texts.pop("name")
+    if name is None:
+        raise ValueError("name must be a string; got null")
+    seed, step, size = values["seed"], values["depth_step"], values["size"]
+    if seed is not None:
+        seed = _whole("seed", seed, 0, 2**63 - 1)
+    if step is not None:
+        if not isinstance(step, int | float) or isinstance(step, bool) or not 0 < step < 1e6:
+            raise ValueError(f"depth_step must be a positive number below 1e6 or null; got {describe(step)}")
+        step = float(step)
+    if not isinstance(size, list) or len(size) != 2:
+        raise ValueError(f"size must be [height, width]; got {describe(size)}")
+    height, width = (_whole("size", side, 1, MAX_SIDE) for side in size)
+    views = _whole("views", values["views"], 1, MAX_VIEWS)
+    voxels = values["voxels"]
+    if not isinstance(voxels, list) or len(voxels) > MAX_VOXELS:
+        raise ValueError(f"voxels must be a list of resolutions; got {describe(voxels)}")
+    cameras = values["cameras"]
+    if not isinstance(cameras, dict):
+        raise ValueError(f"cameras must be an object; got {describe(cameras)}")
+    K = _matrices("intrinsics", cameras["intrinsics"], views, 3)
+    E = _matrices("cam_from_world", cameras["cam_from_world"], views, 4)
+    sizes = (torch.full((views,), side) for side in (height, width))
+    check_cameras("cameras", CameraTensors(torch.from_numpy(K), torch.from_numpy(E), *sizes))
+    resolutions = tuple(_whole("voxels", side, 1, MAX_VOXELS) for side in voxels)
+    return Metadata(
+        name=name,
+        **texts,
+        seed=seed,
+        size=(height, width),
+        depth_step=step,
+        intrinsics=K,
+        cam_from_world=E,
+        voxels=resolutions,
+    )
+
+
+def _whole(field: str, value: Any, low: int, high: int) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+        raise ValueError(f"{field}: expected a whole number from {low} to {high}; got {describe(value)}")
+    return value
+
+
+def _matrices(field: str, rows: Any, views: int, side: int) -> np.ndarray:
+    """(views, side, side) finite float64."""
+    # Lengths first: numpy would make an array of objects of ragged lists, and numbers of strings.
+    ragged = (
+        not isinstance(rows, list)
+        or len(rows) != views
+        or any(not isinstance(matrix, list) or len(matrix) != side for matrix in rows)
+        or any(not isinstance(row, list) or len(row) != side for matrix in rows for row in matrix)
+        or any(type(value) not in (float, int) for matrix in rows for row in matrix for value in row)
+    )
+    if ragged:
+        raise ValueError(f"cameras: {field} must be {views} matrices of {side} x {side} numbers, one a view")
+    array = np.array(rows, np.float64)
+    if not np.isfinite(array).all():
+        raise ValueError(f"cameras: {field} must be finite")
+    return array

@@ -1,0 +1,215 @@
+"""What a training step is fed: `Sample`, one shape with its views, and `Batch`, several of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lsmgeo._checks import check_devices, check_float, check_mask, describe
+from lsmgeo.cameras import CameraTensors, as_tensors
+from lsmgeo.debugging import can_inspect
+from lsmgeo.errors import DTypeError, ShapeError
+
+__all__ = ["Batch", "Sample", "check_sample", "collate"]
+
+
+class Sample(NamedTuple):
+    """One shape, or one scene, and V views of it; all views are of one size.
+
+    Convention:
+        Depth is camera z in world units, 0 where nothing is seen. Occupancy fills [-0.5, 0.5]^3 of the world, voxel i
+        of n centred at ``-0.5 + (i + 0.5) / n``.
+
+    Attributes:
+        images: (V, 3, H, W) float32 in [0, 1], RGB.
+        cameras: leading shape (V,), sizes as tensors.
+        depth: (V, H, W) float32, or None.
+        mask: (V, H, W) bool, True on the object, or None.
+        occupancy: (D, H, W) bool, or None.
+        mesh: path of the mesh it was made from, or None.
+        category: name of its category, or None.
+        name: a name that is unique in its set.
+    """
+
+    images: Tensor
+    cameras: CameraTensors
+    depth: Tensor | None
+    mask: Tensor | None
+    occupancy: Tensor | None
+    mesh: str | None
+    category: str | None
+    name: str
+
+
+class Batch(NamedTuple):
+    """B samples of V views, V the largest of theirs: a pytree, so loaders pin it and compilers trace it.
+
+    What is missing from a sample with fewer views is filled: images and depth with 0, mask with False, cameras with a
+    copy of its first. `view_mask` tells which views are there, and every operator of the library takes it.
+
+    Attributes:
+        images: (B, V, 3, H, W) float32 in [0, 1].
+        cameras: leading shape (B, V), sizes as tensors.
+        depth: (B, V, H, W) float32, or None.
+        mask: (B, V, H, W) bool, or None.
+        occupancy: (B, D, H, W) bool, or None.
+        mesh: B paths or Nones. Pinned by a loader, the three tuples come as lists.
+        category: B names or Nones.
+        name: B names.
+        view_mask: (B, V) bool.
+    """
+
+    images: Tensor
+    cameras: CameraTensors
+    depth: Tensor | None
+    mask: Tensor | None
+    occupancy: Tensor | None
+    mesh: tuple[str | None, ...]
+    category: tuple[str | None, ...]
+    name: tuple[str, ...]
+    view_mask: Tensor
+
+
+def check_sample(sample: Sample, who: str = "sample") -> CameraTensors:
+    """Check the types, shapes and dtypes of a sample's fields, and that cameras and images are of one size.
+
+    Args:
+        sample: what a reader or a renderer made.
+        who: what stands before the field's name in errors.
+
+    Returns:
+        Its cameras with sizes as tensors.
+
+    Raises:
+        DTypeError: a field is not of its type or dtype.
+        ShapeError: shapes do not belong together.
+        DeviceError: tensors are on different devices.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.cameras import orbit
+        >>> cameras = orbit(torch.tensor([0.0, 90.0]), 10.0, 2.0, focal_length=90.0, height=48, width=48)
+        >>> sample = Sample(torch.rand(2, 3, 48, 48), cameras, None, None, None, None, "chair", "chair-0")
+        >>> tuple(check_sample(sample).height.shape)
+        (2,)
+    """
+    if not isinstance(sample, Sample):
+        raise DTypeError(f"{who} must be a lsmgeo.data.Sample; got {describe(sample)}")
+    check_float(who, "images", sample.images, "(V, 3, H, W)", 4, (torch.float32,))
+    views, channels, height, width = sample.images.shape
+    if channels != 3 or 0 in sample.images.shape:
+        raise ShapeError(f"{who}: images must be (V, 3, H, W) with V, H, W >= 1; got {tuple(sample.images.shape)}")
+    cameras = as_tensors(sample.cameras, who)
+    if tuple(cameras.cam_from_world.shape) != (views, 4, 4):
+        raise ShapeError(
+            f"{who}: cameras must have leading shape (V,) = ({views},); got {tuple(cameras.cam_from_world.shape[:-2])}"
+        )
+    sizes = torch.stack([torch.as_tensor(cameras.height), torch.as_tensor(cameras.width)], -1)
+    if can_inspect(sizes) and not bool((sizes == sizes.new_tensor([height, width])).all()):
+        other = next(tuple(size) for size in sizes.tolist() if tuple(size) != (height, width))
+        raise ShapeError(f"{who}: images are {(height, width)} (height, width), a camera is for {other}")
+    if sample.depth is not None:
+        check_float(who, "depth", sample.depth, "(V, H, W)", 3, (torch.float32,))
+        if tuple(sample.depth.shape) != (views, height, width):
+            expected = (views, height, width)
+            raise ShapeError(f"{who}: depth must be (V, H, W) = {expected}; got {tuple(sample.depth.shape)}")
+    if sample.mask is not None:
+        check_mask(who, "mask", sample.mask, (views, height, width), "(V, H, W)")
+    if sample.occupancy is not None:
+        if not isinstance(sample.occupancy, Tensor) or sample.occupancy.dtype != torch.bool:
+            raise DTypeError(f"{who}: occupancy must be a bool tensor (D, H, W); got {describe(sample.occupancy)}")
+        if sample.occupancy.dim() != 3 or sample.occupancy.numel() == 0:
+            raise ShapeError(f"{who}: occupancy must be (D, H, W); got {tuple(sample.occupancy.shape)}")
+    for field in ("mesh", "category", "name"):
+        value = getattr(sample, field)
+        if not isinstance(value, str) and (value is not None or field == "name"):
+            raise DTypeError(f"{who}: {field} must be a string{' or None' * (field != 'name')}; got {describe(value)}")
+    tensors = {field: getattr(sample, field) for field in ("images", "depth", "mask", "occupancy")}
+    check_devices(who, **tensors, cameras=cameras.intrinsics)
+    return cameras
+
+
+def collate(samples: Sequence[Sample]) -> Batch:
+    """Make a batch of samples: views are padded to the largest number of them; for ``DataLoader(collate_fn=...)``.
+
+    Args:
+        samples: at least one; images of one size, cameras of one dtype, occupancy of one shape. A field is None in all
+            samples or in none.
+
+    Returns:
+        The batch.
+
+    Raises:
+        DTypeError: no sample, something else than samples, or cameras of different dtypes.
+        ShapeError: sizes differ, or a field is None in some samples only.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.cameras import orbit
+        >>> def sample(views, name):
+        ...     cameras = orbit(torch.zeros(views), 10.0, 2.0, focal_length=90.0, height=48, width=48)
+        ...     return Sample(torch.rand(views, 3, 48, 48), cameras, None, None, None, None, None, name)
+        >>> batch = collate([sample(1, "a"), sample(3, "b")])
+        >>> batch.view_mask.tolist(), batch.name
+        ([[True, False, False], [True, True, True]], ('a', 'b'))
+    """
+    if not isinstance(samples, Sequence) or isinstance(samples, Sample | str) or not samples:
+        raise DTypeError(f"collate: samples must be a list or tuple with at least one Sample; got {describe(samples)}")
+    cameras = [check_sample(sample, f"collate: samples[{i}]") for i, sample in enumerate(samples)]
+    first = samples[0]
+    for i, sample in enumerate(samples):
+        _agree(i, "images' (height, width)", tuple(sample.images.shape[2:]), tuple(first.images.shape[2:]))
+        for field in ("depth", "mask", "occupancy"):
+            ours, theirs = getattr(sample, field), getattr(first, field)
+            if (ours is None) != (theirs is None):
+                given, missing = (i, 0) if theirs is None else (0, i)
+                raise ShapeError(
+                    f"collate: {field} must be there in all samples or in none; "
+                    f"samples[{given}] ({samples[given].name!r}) has it, samples[{missing}] "
+                    f"({samples[missing].name!r}) has not"
+                )
+        if sample.occupancy is not None and first.occupancy is not None:
+            _agree(i, "occupancy's (D, H, W)", tuple(sample.occupancy.shape), tuple(first.occupancy.shape))
+        if cameras[i].intrinsics.dtype != cameras[0].intrinsics.dtype:
+            raise DTypeError(
+                f"collate: cameras must be of one dtype (lsmgeo.cameras.to); samples[{i}] has "
+                f"{cameras[i].intrinsics.dtype}, samples[0] {cameras[0].intrinsics.dtype}"
+            )
+    counts = [len(sample.images) for sample in samples]
+    most = max(counts)
+    view_mask = torch.arange(most) < torch.tensor(counts)[:, None]
+    return Batch(
+        _padded([sample.images for sample in samples], most),
+        CameraTensors(*(_repeated(list(fields), most) for fields in zip(*cameras, strict=True))),
+        None if first.depth is None else _padded([sample.depth for sample in samples], most),
+        None if first.mask is None else _padded([sample.mask for sample in samples], most),
+        None if first.occupancy is None else torch.stack([sample.occupancy for sample in samples]),  # type: ignore[misc]
+        tuple(sample.mesh for sample in samples),
+        tuple(sample.category for sample in samples),
+        tuple(sample.name for sample in samples),
+        view_mask.to(first.images.device),
+    )
+
+
+def _agree(index: int, what: str, ours: tuple[int, ...], theirs: tuple[int, ...]) -> None:
+    if ours != theirs:
+        raise ShapeError(f"collate: {what} must be equal; samples[{index}] has {ours}, samples[0] {theirs}")
+
+
+def _padded(parts: list[Any], most: int) -> Tensor:
+    """(V_i, ...) tensors as one (B, most, ...), the rest 0."""
+    if all(len(part) == most for part in parts):
+        return torch.stack(parts)
+    result = parts[0].new_zeros((len(parts), most, *parts[0].shape[1:]))
+    for row, part in zip(result, parts, strict=True):
+        row[: len(part)] = part
+    return result
+
+
+def _repeated(parts: list[Any], most: int) -> Tensor:
+    """(V_i, ...) tensors as one (B, most, ...), the rest copies of each one's first."""
+    full = [torch.cat((part, part[:1].expand(most - len(part), *part.shape[1:]))) for part in parts]
+    return torch.stack(full)

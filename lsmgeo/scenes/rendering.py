@@ -23,7 +23,8 @@ __all__ = ["Hits", "Rendering", "render", "trace"]
 
 # Shadow rays leave a surface from this far above it, in world units.
 SHADOW_OFFSET = 1e-4
-# Views that an accelerator renders together.
+# Where views fit the caches, and solids are visited within windows; elsewhere many views go together.
+ONE_VIEW_AT_A_TIME = ("cpu",)
 VIEWS_AT_ONCE = 64
 
 
@@ -132,11 +133,8 @@ def render(
 
 
 def _blocks(count: int, views: int, device: torch.device) -> Iterator[tuple[slice, list[int], list[slice]]]:
-    """What is rendered together: scenes, the scene of each view within them, and slices of all views.
-
-    On a CPU a view alone: it fits the caches, and solids are visited within windows. Elsewhere many views of many scenes.
-    """
-    if device.type == "cpu":
+    """What is rendered together: scenes, the scene of each view within them, and slices of all views."""
+    if device.type in ONE_VIEW_AT_A_TIME:
         for scene in range(count):
             yield slice(scene, scene + 1), [0], [slice(v, v + 1) for v in range(scene * views, (scene + 1) * views)]
         return
@@ -280,8 +278,8 @@ def _lights(who: str, lights: Lights, count: int, device: torch.device, dtype: t
         value = value.expand(count, *value.shape) if value.dim() == rank - 1 else value
         if value.dim() != rank or value.shape[0] != count or value.shape[-1] != 3:
             raise ShapeError(
-                f"{who}: lights.{name} must be {'(S, L, 3)' if rank == 3 else '(S, 3)'} with S = {count} scenes, or the "
-                f"same without S; got {tuple(value.shape)}"
+                f"{who}: lights.{name} must be {'(S, L, 3)' if rank == 3 else '(S, 3)'} with S = {count} scenes, or "
+                f"without S; got {tuple(value.shape)}"
             )
         whole.append(value.to(device, dtype))
     if whole[0].shape != whole[1].shape:

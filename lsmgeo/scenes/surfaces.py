@@ -49,7 +49,7 @@ def normals(solids: Tables, rows: Tensor, points: Tensor) -> Tensor:
     gradient[1] -= slope
     local_normal = torch.where(is_round, gradient, facet)  # a covector: it goes with the transpose
     normal = (linear * local_normal[:, None]).sum(0)
-    return normal * (side / torch.linalg.vector_norm(normal, dim=0).clamp_min(TINY))
+    return normal * (side / normal.square().sum(0).sqrt().clamp_min(TINY))
 
 
 def albedo(solids: Tables, rows: Tensor, points: Tensor) -> Tensor:

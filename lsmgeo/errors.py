@@ -61,3 +61,7 @@ class DataError(LsmGeoError, OSError):
         super().__init__(f"{path}: {reason}")
         self.path = path
         self.reason = reason
+
+    def __reduce__(self) -> tuple[type[DataError], tuple[str | PathLike[str], str]]:
+        # The default rebuilds an error from its one message, and a pool of processes that meets this breaks.
+        return type(self), (self.path, self.reason)

@@ -84,6 +84,11 @@ class ShardIndex:
         """The suffixes of a shape's members and their places in it."""
         return self.layouts[self.layout[row]]
 
+    def view_counts(self) -> np.ndarray:
+        """(N,) how many pictures each shape has."""
+        counts = [sum(s.endswith(".png") and "depth" not in s for s in layout) for layout in self.layouts]
+        return np.array(counts, np.int64)[self.layout]
+
     def member(self, row: int, suffix: str) -> Member:
         """One member of a shape.
 

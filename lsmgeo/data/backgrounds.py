@@ -1,0 +1,124 @@
+"""What stands behind the objects of a shard's pictures, which hold the objects alone."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, TypeAlias
+
+import numpy as np
+
+from lsmgeo._checks import check_number, describe
+from lsmgeo.data.files import child, read_image
+from lsmgeo.errors import DataError, OptionError
+
+__all__ = ["Background", "BackgroundSource", "make_background"]
+
+SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+class BackgroundSource(Protocol):
+    """Something that draws backgrounds; it can be sent to another process."""
+
+    @property
+    def is_random(self) -> bool:
+        """Whether it needs a generator."""
+
+    def __call__(self, generator: np.random.Generator | None, height: int, width: int) -> np.ndarray:
+        """(3, H, W) float32 in [0, 1], or (3, 1, 1)."""
+
+
+Background: TypeAlias = str | os.PathLike[str] | Sequence[float] | BackgroundSource
+
+
+@dataclass(frozen=True)
+class _Plain:
+    colour: tuple[float, float, float]
+    is_random: bool = False
+
+    def __call__(self, generator: np.random.Generator | None, height: int, width: int) -> np.ndarray:
+        return np.array(self.colour, np.float32).reshape(3, 1, 1)
+
+
+@dataclass(frozen=True)
+class _Analytic:
+    is_random: bool = True
+
+    def __call__(self, generator: np.random.Generator | None, height: int, width: int) -> np.ndarray:
+        from lsmgeo import scenes
+
+        if generator is None:
+            raise OptionError("background: 'random' needs a generator")
+        return np.asarray(scenes.background(generator, height, width), np.float32)
+
+
+@dataclass(frozen=True)
+class _Folder:
+    """Cuttings of photographs: any place, half to all of the largest size that fits, scaled to what is needed."""
+
+    folder: Path
+    names: tuple[str, ...]
+    is_random: bool = True
+
+    def __call__(self, generator: np.random.Generator | None, height: int, width: int) -> np.ndarray:
+        from PIL import Image
+
+        if generator is None:
+            raise OptionError("background: a folder of pictures needs a generator")
+        name = self.names[int(generator.random() * len(self.names))]
+        pixels = read_image(child(self.folder, name, self.folder))
+        scale = min(pixels.shape[0] / height, pixels.shape[1] / width) * (0.5 + 0.5 * generator.random())
+        tall, wide = (max(1, round(side * scale)) for side in (height, width))
+        top = int(generator.random() * (pixels.shape[0] - tall + 1))
+        left = int(generator.random() * (pixels.shape[1] - wide + 1))
+        cutting = Image.fromarray(pixels[top : top + tall, left : left + wide])
+        resized = np.asarray(cutting.resize((width, height), Image.Resampling.BILINEAR))
+        return resized.transpose(2, 0, 1).astype(np.float32) / np.float32(255)
+
+
+def make_background(background: Background) -> BackgroundSource:
+    """Make what draws backgrounds of what a caller named.
+
+    Args:
+        background: "white"; an RGB colour in [0, 1]; "random" for analytic ones (`lsmgeo.scenes.background`); a folder
+            of PNG or JPEG pictures, of which random cuttings are taken; or something that this function made before.
+
+    Raises:
+        OptionError: something else.
+        DataError: the folder cannot be read or holds no picture.
+
+    Example:
+        >>> make_background("white")(None, 48, 64).ravel().tolist()
+        [1.0, 1.0, 1.0]
+    """
+    if isinstance(background, _Plain | _Analytic | _Folder):
+        return background
+    if background == "white":
+        return _Plain((1.0, 1.0, 1.0))
+    if background == "random":
+        return _Analytic()
+    if isinstance(background, str | os.PathLike):
+        return _folder(Path(background))
+    if callable(background):
+        return background
+    try:
+        values = [check_number("background", "a colour", value, "three numbers in [0, 1]") for value in background]
+    except TypeError:
+        values = []
+    if len(values) != 3 or not all(0 <= value <= 1 for value in values):
+        raise OptionError(
+            f"background must be 'white', 'random', three numbers in [0, 1] or a folder; got {describe(background)}"
+        )
+    return _Plain((values[0], values[1], values[2]))
+
+
+def _folder(folder: Path) -> BackgroundSource:
+    try:
+        names = tuple(sorted(entry.name for entry in os.scandir(folder) if entry.name.lower().endswith(SUFFIXES)))
+    except (OSError, ValueError) as error:
+        raise DataError(folder, f"is no folder of backgrounds, 'white' or 'random' ({error})") from error
+    if not names:
+        raise DataError(folder, "holds no PNG or JPEG picture")
+    return _Folder(folder, names)

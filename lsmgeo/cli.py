@@ -1,16 +1,21 @@
-"""The command line: ``lsmgeo demo``, ``lsmgeo reconstruct``. Heavy imports wait until a command runs."""
+"""The command line: ``lsmgeo demo``, ``reconstruct``, ``render``. Heavy imports wait until a command runs."""
 
 from __future__ import annotations
 
 import re
 import sys
 from collections.abc import Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-__all__ = ["demo", "main", "reconstruct"]
+if TYPE_CHECKING:
+    from contextlib import ExitStack
+
+__all__ = ["demo", "main", "reconstruct", "render"]
 
 KINDS = {"int": "a whole number", "float": "a finite number"}
 LONGEST_MESSAGE = 300
+MOST_SKIPPED = 5
+CLUSTER_SECONDS = 20
 
 
 def demo(out: str = "lsmgeo-demo") -> None:
@@ -130,6 +135,89 @@ def reconstruct(
         print(f"{what + ':':<28} {path.resolve()}")
 
 
+def render(
+    source: str = "synthetic-13",
+    shapes: int | None = None,
+    views: int = 20,
+    out: str = "lsmgeo-set",
+    size: int = 224,
+    voxels: tuple[int, ...] = (32, 64),
+    depth: bool = True,
+    shadows: bool = False,
+    seed: int = 0,
+    per_shard: int = 50,
+    jobs: int = -1,
+    cluster: str | None = None,
+    on_error: Literal["skip", "raise"] = "skip",
+) -> None:
+    """Make a training set: views, depth and voxels of many shapes, in tar shards; run again, it goes on where it was.
+
+    Args:
+        source: "synthetic-13", or a folder of meshes such as a ShapeNetCore tree.
+        shapes: number of shapes; by default all meshes of the folder.
+        views: pictures of each shape.
+        out: folder for the shards; created where it does not exist.
+        size: height and width of the pictures in pixels.
+        voxels: resolutions of the occupancy grids.
+        depth: whether to write depth.
+        shadows: whether shapes cast shadows on themselves.
+        seed: decides shapes, lights and views.
+        per_shard: shapes in a shard.
+        jobs: worker processes; -1 takes all cores.
+        cluster: address of a Dask scheduler whose workers see the same folders; by default this machine works alone.
+        on_error: what to do with a mesh that cannot be used.
+    """
+    import contextlib
+    import time
+    from pathlib import Path
+
+    from lsmgeo.data import Recipe, render_set
+
+    start = time.perf_counter()
+    with contextlib.ExitStack() as stack:
+        if cluster is not None:
+            _join(cluster, stack)
+        made = render_set(
+            source,
+            out,
+            Recipe(seed, views, size, voxels, depth, shadows),
+            shapes=shapes,
+            per_shard=per_shard,
+            jobs=jobs,
+            on_error=on_error,
+            progress=True,
+        )
+    seconds = time.perf_counter() - start
+    megabytes = sum(path.stat().st_size for path in made.shards) / 1e6
+    print(f"shapes:   {made.shapes}, {views} views each at {size} x {size}")
+    print(f"shards:   {len(made.shards)} in {Path(out).resolve()}, {megabytes:.0f} MB; {made.kept} were there already")
+    if made.kept < len(made.shards):
+        fresh = "" if made.kept else f", {made.shapes * views / seconds:.0f} views a second"
+        print(f"time:     {seconds:.1f} s{fresh}")
+    if made.skipped:
+        print(f"skipped:  {len(made.skipped)} meshes that cannot be used")
+        for path, reason in made.skipped[:MOST_SKIPPED]:
+            print(f"          {path}: {reason}")
+        if len(made.skipped) > MOST_SKIPPED:
+            print(f"          and {len(made.skipped) - MOST_SKIPPED} more")
+
+
+def _join(address: str, stack: ExitStack) -> None:
+    """Hand the work of joblib to a Dask cluster."""
+    from lsmgeo.errors import OptionError
+
+    try:
+        import joblib
+        from distributed import Client
+    except ImportError as error:
+        raise OptionError("render: cluster needs joblib and distributed; install them first") from error
+    try:
+        stack.enter_context(Client(address, timeout=CLUSTER_SECONDS))
+    except (OSError, ValueError) as error:
+        raise OptionError(f"render: no Dask scheduler answers at cluster {address!r} ({error})") from error
+    stack.enter_context(joblib.parallel_config("dask"))
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -167,12 +255,12 @@ def _run(arguments: Sequence[str] | None) -> None:
     except PackageNotFoundError:
         from lsmgeo import __version__ as release
     auto_cli(
-        {"demo": demo, "reconstruct": reconstruct},
+        {"demo": demo, "reconstruct": reconstruct, "render": render},
         args=None if arguments is None else list(arguments),
         as_positional=True,
         prog="lsmgeo",
         version=release,
-        description="Plane-sweep depth from posed photographs, and a demonstration on a known scene.",
+        description="Depth from posed photographs, training sets of rendered shapes, and a demonstration.",
         # Errors come here, to become one line; and an option is what it is called, not how its name begins.
         exit_on_error=False,
         allow_abbrev=False,

@@ -5,19 +5,27 @@ from lsmgeo.data.detect import open_scene
 from lsmgeo.data.files import atomic_file, read_image, write_atomic, write_point_cloud
 from lsmgeo.data.loading import EpochSampler, ShapeDataset
 from lsmgeo.data.members import encode_sample
+from lsmgeo.data.mesh_rendering import render_mesh
+from lsmgeo.data.meshes import Mesh, from_trimesh, load_mesh, normalise
 from lsmgeo.data.middlebury import read_middlebury
 from lsmgeo.data.posed import Observations, PosedImages, SparsePoints
+from lsmgeo.data.render_set import Made, render_set
 from lsmgeo.data.sample import Batch, Sample, check_sample, collate
 from lsmgeo.data.shard_reading import ShardSet
 from lsmgeo.data.shards import hash_settings, verify_shard, write_shard
+from lsmgeo.data.sources import Recipe
+from lsmgeo.data.voxelise import voxelise
 
 open = open_scene
 
 __all__ = [
     "Batch",
     "EpochSampler",
+    "Made",
+    "Mesh",
     "Observations",
     "PosedImages",
+    "Recipe",
     "Sample",
     "ShapeDataset",
     "ShardSet",
@@ -26,13 +34,19 @@ __all__ = [
     "check_sample",
     "collate",
     "encode_sample",
+    "from_trimesh",
     "hash_settings",
+    "load_mesh",
+    "normalise",
     "open",
     "open_scene",
     "read_colmap",
     "read_image",
     "read_middlebury",
+    "render_mesh",
+    "render_set",
     "verify_shard",
+    "voxelise",
     "write_atomic",
     "write_point_cloud",
     "write_shard",

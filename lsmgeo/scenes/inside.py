@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -10,12 +10,14 @@ from torch import Tensor
 from lsmgeo._checks import check_geometry
 from lsmgeo.errors import ShapeError
 from lsmgeo.grids import VoxelGrid
-from lsmgeo.scenes.tables import Scene, Tables, check_scenes, layout
+from lsmgeo.scenes.tables import Placed, Scene, Tables, check_scenes, layout
 
 __all__ = ["occupancy", "voxels"]
 
 # Points of one scene that are tested together: their local coordinates fit the caches.
 POINTS_AT_ONCE = 1 << 15
+# Boxes around solids are widened by this, for rounding.
+MARGIN = 1e-9
 
 
 def occupancy(scenes: Sequence[Scene], points: Tensor) -> Tensor:
@@ -71,35 +73,74 @@ def voxels(scenes: Sequence[Scene], grid: VoxelGrid | int = 32) -> Tensor:
         >>> scenes.voxels([scenes.Scene([scenes.sphere((0, 0, 0), 0.5)])], 4).sum()
         tensor(32)
     """
+    scenes = check_scenes("voxels", scenes)
     grid = VoxelGrid(grid) if isinstance(grid, int) else grid
-    centers = grid.centers()
+    centers = grid.centers().double()
     if centers.dim() != 4:
         raise ShapeError(f"voxels: grid must be one for all scenes; got centres {tuple(centers.shape)}")
-    return occupancy(scenes, centers[None])
+    axes = (centers[0, 0, :, 0], centers[0, :, 0, 1], centers[:, 0, 0, 2])
+    x, y, z = torch.meshgrid(*axes, indexing="ij")
+    if not torch.equal(torch.stack((x, y, z), -1).transpose(0, 2), centers):  # turned against the world's axes
+        return occupancy(scenes, centers[None])
+    return torch.stack([_occupied_lattice(scene, axes) for scene in scenes])
 
 
 def _occupied(scene: Scene, points: Tensor) -> Tensor:
+    """Whether points (N, 3) lie in a scene."""
     solids, (placed,) = layout([scene])
     solids = solids.to(points.device, torch.float64)
     inside = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for first in range(0, len(points), POINTS_AT_ONCE):
-        block = points[first : first + POINTS_AT_ONCE].T.double().contiguous()  # (3, K)
+        block = points[first : first + POINTS_AT_ONCE].T.double()  # (3, K)
+
+        def local(row: int, block: Tensor = block) -> Tensor:
+            offset = block - solids.center[row, :, None]
+            return (solids.linear[row, :, :, None] * offset).sum(1)
+
         for solid in placed:
-            held = _holds(solids, solid.row, block)
-            for _, cut in solid.cuts:
-                held &= ~_holds(solids, cut, block)
-            inside[first : first + POINTS_AT_ONCE] |= held
+            inside[first : first + POINTS_AT_ONCE] |= _remains(solids, solid, local)
     return inside
 
 
-def _holds(solids: Tables, row: int, points: Tensor) -> Tensor:
-    """Whether points (3, K) lie in one solid, by the functions whose zeros are its faces (see `Tables`)."""
-    linear = solids.linear[row]
-    offset = points - solids.center[row, :, None]
-    local = (solids.linear[row, :, :, None] * offset).sum(1)
-    within = ((local <= solids.high[row, :, None]) & (local >= solids.low[row, :, None])).all(0)
+def _occupied_lattice(scene: Scene, axes: Sequence[Tensor]) -> Tensor:
+    """The same for the points of a lattice along the world's axes, (W,), (H,) and (D,): (D, H, W).
+
+    A solid is looked for within the box around it; local coordinates are a sum of one term an axis.
+    """
+    solids, (placed,) = layout([scene])
+    inside = torch.zeros([len(axis) for axis in reversed(axes)], dtype=torch.bool)
+    for solid, part in zip(placed, scene.solids, strict=True):
+        x, y, z = (
+            slice(int((axis < lower - MARGIN).sum()), int((axis <= upper + MARGIN).sum()))
+            for axis, lower, upper in zip(axes, *part.bounds(), strict=True)
+        )
+        some = [axis[window] for axis, window in zip(axes, (x, y, z), strict=True)]
+
+        def local(row: int, some: list[Tensor] = some) -> Tensor:
+            along = [
+                solids.linear[row, :, axis, None] * (values - solids.center[row, axis])  # (3, W), (3, H), (3, D)
+                for axis, values in enumerate(some)
+            ]
+            return along[0][:, None, None, :] + along[1][:, None, :, None] + along[2][:, :, None, None]
+
+        inside[z, y, x] |= _remains(solids, solid, local)
+    return inside
+
+
+def _remains(solids: Tables, solid: Placed, local: Callable[[int], Tensor]) -> Tensor:
+    """Whether points lie in a solid and in none of its cuts; ``local`` gives their coordinates (3, ...) for a row."""
+    held = _holds(solids, solid.row, local(solid.row))
+    for _, cut in solid.cuts:
+        held &= ~_holds(solids, cut, local(cut))
+    return held
+
+
+def _holds(solids: Tables, row: int, local: Tensor) -> Tensor:
+    """Whether local points (3, ...) lie in one solid, by the functions whose zeros are its faces (see `Tables`)."""
+    shape = (3,) + (1,) * (local.dim() - 1)
+    within = ((local <= solids.high[row].view(shape)) & (local >= solids.low[row].view(shape))).all(0)
     if bool(solids.round[row].any()):
-        radial = (solids.round[row, :, None] * local.square()).sum(0)
+        radial = (solids.round[row].view(shape) * local.square()).sum(0)
         radius = solids.radius[row] + solids.slope[row] * local[1]
         within &= radial <= radius.square()
     return within

@@ -8,9 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lsmgeo import scenes
+from lsmgeo import VoxelGrid, scenes
 from lsmgeo.cameras import CameraTensors, orbit
 from lsmgeo.scenes import rendering
+from tests import oracle
 from tests.oracle import solids as truth
 from tests.scenes.drawn import KINDS, Drawn, drawn, make
 
@@ -182,3 +183,16 @@ def test_a_floor_reaches_the_horizon():
     camera = CameraTensors(torch.tensor([[[[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]]]), torch.eye(4)[None, None], 9, 9)
     depth = scenes.render([floor], camera, SUN).depth[0, 0, :, 2]
     torch.testing.assert_close(depth, torch.tensor([0.0] * 5 + [8.0 / k for k in (1, 2, 3, 4)]))
+
+
+@settings(max_examples=50)
+@given(drawn(), st.booleans())
+def test_voxels_agree_with_the_oracle(wanted, turned):
+    pose = torch.eye(4, dtype=torch.float64)
+    if turned:
+        pose[:3, :3] = torch.from_numpy(oracle.rotation(np.array([0.3, -0.5, 0.2])))
+    grid = VoxelGrid((5, 6, 7), (-0.9, -0.8, -0.7), (0.8, 0.9, 1.0), world_from_grid=pose)
+    points = grid.centers().double().reshape(-1, 3).numpy()
+    found = scenes.voxels([wanted.scene], grid)
+    np.testing.assert_array_equal(found[0].flatten().numpy(), truth.holds(wanted.parts, points))
+    assert found.shape == (1, 5, 6, 7)

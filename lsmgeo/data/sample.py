@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.data import default_collate
 
 from lsmgeo._checks import check_devices, check_float, check_mask, describe
 from lsmgeo.cameras import CameraTensors, as_tensors
@@ -180,13 +181,17 @@ def collate(samples: Sequence[Sample]) -> Batch:
             )
     counts = [len(sample.images) for sample in samples]
     most = max(counts)
+    depth, mask, occupancy = (
+        [tensor for sample in samples if (tensor := getattr(sample, field)) is not None]
+        for field in ("depth", "mask", "occupancy")
+    )
     view_mask = torch.arange(most) < torch.tensor(counts)[:, None]
     return Batch(
         _padded([sample.images for sample in samples], most),
         CameraTensors(*(_repeated(list(fields), most) for fields in zip(*cameras, strict=True))),
-        None if first.depth is None else _padded([sample.depth for sample in samples], most),
-        None if first.mask is None else _padded([sample.mask for sample in samples], most),
-        None if first.occupancy is None else torch.stack([sample.occupancy for sample in samples]),  # type: ignore[misc]
+        _padded(depth, most) if depth else None,
+        _padded(mask, most) if mask else None,
+        _stacked(occupancy) if occupancy else None,
         tuple(sample.mesh for sample in samples),
         tuple(sample.category for sample in samples),
         tuple(sample.name for sample in samples),
@@ -199,17 +204,22 @@ def _agree(index: int, what: str, ours: tuple[int, ...], theirs: tuple[int, ...]
         raise ShapeError(f"collate: {what} must be equal; samples[{index}] has {ours}, samples[0] {theirs}")
 
 
-def _padded(parts: list[Any], most: int) -> Tensor:
+def _stacked(parts: list[Tensor]) -> Tensor:
+    """Tensors of one shape as one, in a loader's worker at once in the memory that it shares with the training loop."""
+    return default_collate(parts)
+
+
+def _padded(parts: list[Tensor], most: int) -> Tensor:
     """(V_i, ...) tensors as one (B, most, ...), the rest 0."""
-    if all(len(part) == most for part in parts):
-        return torch.stack(parts)
-    result = parts[0].new_zeros((len(parts), most, *parts[0].shape[1:]))
-    for row, part in zip(result, parts, strict=True):
-        row[: len(part)] = part
-    return result
+    return _stacked([_longer(part, part.new_zeros((1, *part.shape[1:])), most) for part in parts])
 
 
-def _repeated(parts: list[Any], most: int) -> Tensor:
+def _repeated(parts: list[Tensor], most: int) -> Tensor:
     """(V_i, ...) tensors as one (B, most, ...), the rest copies of each one's first."""
-    full = [torch.cat((part, part[:1].expand(most - len(part), *part.shape[1:]))) for part in parts]
-    return torch.stack(full)
+    return _stacked([_longer(part, part[:1], most) for part in parts])
+
+
+def _longer(part: Tensor, filling: Tensor, most: int) -> Tensor:
+    if len(part) == most:
+        return part
+    return torch.cat((part, filling.expand(most - len(part), *part.shape[1:])))

@@ -143,7 +143,7 @@ class ShardSet:
             generator: what they are drawn with.
 
         Returns:
-            The sample: float32 cameras, the mask from the pictures' alpha, ``mask > 0.5``.
+            The sample: float32 cameras, the mask where the pictures' alpha is above 127.
 
         Raises:
             OptionError: no such shape or view, or an option that is none.
@@ -155,11 +155,12 @@ class ShardSet:
         if source.is_random and generator is None:
             raise OptionError("ShardSet.read: a random background needs a generator")
         chosen = _views(views, int(self.view_counts[index]))
+        # All are read before anything of their size is made: what a damaged json claims is made by nobody.
         pictures = [self._picture(number, row, view, metadata) for view in chosen]
-        masks = np.stack([picture[..., 3] > 127 for picture in pictures])
         images = np.empty((len(chosen), 3, *metadata.size), np.float32)
-        for image, picture in zip(images, pictures, strict=True):
-            _composite(image, picture, source(generator, *metadata.size))
+        masks = np.empty((len(chosen), *metadata.size), np.bool_)
+        for image, mask, picture in zip(images, masks, pictures, strict=True):
+            _composite(image, mask, picture, source(generator, *metadata.size))
         depths = self._depth(number, row, chosen, metadata) if check_flag("ShardSet.read", "depth", depth) else None
         grid = None if occupancy is None else self._occupancy(number, row, occupancy, metadata)
         return Sample(
@@ -261,10 +262,9 @@ def _views(views: Sequence[int] | None, there: int) -> Sequence[int]:
     return chosen
 
 
-def _composite(image: np.ndarray, picture: np.ndarray, background: np.ndarray) -> None:
-    """``alpha colour + (1 - alpha) background`` of an RGBA picture, into (3, H, W)."""
+def _composite(image: np.ndarray, mask: np.ndarray, picture: np.ndarray, background: np.ndarray) -> None:
+    """Fill (3, H, W) with the colours of an RGBA picture where its alpha is above 127, else with the background."""
     planes = np.ascontiguousarray(picture.transpose(2, 0, 1))
-    alpha = planes[3] / np.float32(255)
+    np.greater(planes[3], 127, out=mask)
     np.divide(planes[:3], np.float32(255), out=image, dtype=np.float32)
-    image *= alpha
-    image += (1 - alpha) * background
+    np.copyto(image, background, where=~mask)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lsmgeo._checks import describe
-from lsmgeo.data.files import atomic_file, write_atomic
+from lsmgeo.data.files import atomic_file
 from lsmgeo.data.members import SUFFIX, format_key
 from lsmgeo.data.metadata import decode_metadata
 from lsmgeo.data.shard_index import BLOCK, MAX_SHAPES, read_sidecar, sidecar_path
@@ -91,8 +91,9 @@ def write_shard(
         raise DataError(path, "a shard's name must end in .tar and begin with no dot")
     if not isinstance(settings_hash, str) or not settings_hash.isprintable() or not 0 < len(settings_hash) <= 128:
         raise OptionError(f"write_shard: settings_hash must be 1 to 128 characters; got {describe(settings_hash)}")
-    _remove_leftovers(path)
     sidecar = sidecar_path(path)
+    for file in (path, sidecar):
+        _remove_leftovers(file)
     layouts: dict[tuple[str, ...], int] = {}
     entries: list[dict[str, Any]] = []
     with atomic_file(path) as stream:
@@ -123,7 +124,9 @@ def write_shard(
         "layouts": [list(layout) for layout in layouts],
         "entries": entries,
     }
-    write_atomic(sidecar, json.dumps(index, separators=(",", ":")).encode() + b"\n")
+    with atomic_file(sidecar) as stream:
+        _lock(stream)
+        stream.write(json.dumps(index, separators=(",", ":")).encode() + b"\n")
     return path
 
 
@@ -213,7 +216,7 @@ def _lock(stream: AtomicFile) -> None:
 
 
 def _remove_leftovers(path: Path) -> None:
-    """Remove what killed processes left of this shard: temporary files that nobody holds locked."""
+    """Remove what killed processes left of this file: temporary files that nobody holds locked."""
     try:
         import fcntl
     except ImportError:

@@ -75,13 +75,14 @@ def voxels(scenes: Sequence[Scene], grid: VoxelGrid | int = 32) -> Tensor:
     """
     scenes = check_scenes("voxels", scenes)
     grid = VoxelGrid(grid) if isinstance(grid, int) else grid
-    centers = grid.centers().double()
-    if centers.dim() != 4:
-        raise ShapeError(f"voxels: grid must be one for all scenes; got centres {tuple(centers.shape)}")
-    axes = (centers[0, 0, :, 0], centers[0, :, 0, 1], centers[:, 0, 0, 2])
-    x, y, z = torch.meshgrid(*axes, indexing="ij")
-    if not torch.equal(torch.stack((x, y, z), -1).transpose(0, 2), centers):  # turned against the world's axes
+    if grid.world_from_grid is not None:
+        centers = grid.centers()
+        if centers.dim() != 4:
+            raise ShapeError(f"voxels: grid must be one for all scenes; got centres {tuple(centers.shape)}")
         return occupancy(scenes, centers[None])
+    depth, height, width = grid.shape  # type: ignore[misc]
+    matrix, counts = grid.world_from_lattice, (width, height, depth)
+    axes = [matrix[i, i] * torch.arange(count, dtype=torch.float64) + matrix[i, 3] for i, count in enumerate(counts)]
     return torch.stack([_occupied_lattice(scene, axes) for scene in scenes])
 
 
@@ -102,7 +103,7 @@ def _occupied(scene: Scene, points: Tensor) -> Tensor:
     return inside
 
 
-def _occupied_lattice(scene: Scene, axes: Sequence[Tensor]) -> Tensor:
+def _occupied_lattice(scene: Scene, axes: list[Tensor]) -> Tensor:
     """The same for the points of a lattice along the world's axes, (W,), (H,) and (D,): (D, H, W).
 
     A solid is looked for within the box around it; local coordinates are a sum of one term an axis.

@@ -188,11 +188,12 @@ def test_a_floor_reaches_the_horizon():
 @settings(max_examples=50)
 @given(drawn(), st.booleans())
 def test_voxels_agree_with_the_oracle(wanted, turned):
-    pose = torch.eye(4, dtype=torch.float64)
+    pose = np.eye(4)
     if turned:
-        pose[:3, :3] = torch.from_numpy(oracle.rotation(np.array([0.3, -0.5, 0.2])))
-    grid = VoxelGrid((5, 6, 7), (-0.9, -0.8, -0.7), (0.8, 0.9, 1.0), world_from_grid=pose)
-    points = grid.centers().double().reshape(-1, 3).numpy()
+        pose[:3, :3] = oracle.rotation(np.array([0.3, -0.5, 0.2]))
+    matrix = torch.from_numpy(pose) if turned else None
+    grid = VoxelGrid((5, 6, 7), (-0.9, -0.8, -0.7), (0.8, 0.9, 1.0), world_from_grid=matrix)
+    points = oracle.voxel_sites((5, 6, 7), np.array([-0.9, -0.8, -0.7]), np.array([0.8, 0.9, 1.0]), pose).reshape(-1, 3)
     found = scenes.voxels([wanted.scene], grid)
     np.testing.assert_array_equal(found[0].flatten().numpy(), truth.holds(wanted.parts, points))
     assert found.shape == (1, 5, 6, 7)

@@ -1,0 +1,513 @@
+"""Shards: what is written is read, by us and by others; stopped writers leave nothing; damage is noticed."""
+
+import gc
+import io
+import json
+import os
+import pickle
+import signal
+import tarfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import webdataset
+from PIL import Image
+
+from lsmgeo.data import ShardSet, encode_sample, files, hash_settings, shard_reading, verify_shard, write_shard
+from lsmgeo.data.png import DEPTH, RGBA, decode_png, encode_png
+from lsmgeo.errors import CameraError, DataError, DTypeError, OptionError, ShapeError
+from tests.data.shapes import SETTINGS, STEP, assert_equal, make_shape, write_set
+
+NAMES = ["set-000000.json", "set-000000.tar", "set-000001.json", "set-000001.tar"]
+pytestmark = pytest.mark.timeout(120)
+
+
+def test_what_is_written_is_read(tmp_path):
+    shapes = write_set(tmp_path)
+    shards = ShardSet(tmp_path)
+    assert sorted(os.listdir(tmp_path)) == NAMES
+    assert shards.names == [shape.name for shape in shapes]
+    assert shards.categories == [shape.category for shape in shapes]
+    assert shards.splits == [shape.split for shape in shapes]
+    assert shards.view_counts.tolist() == [3] * 6
+    for index in (5, 0, 3):
+        assert_equal(shards.read(index, occupancy=8), shapes[index], range(3))
+        assert_equal(shards.read(index, views=[2, 0], occupancy=16), shapes[index], (2, 0), side=16)
+        bare = shards.read(index, views=np.array([1]), depth=False, occupancy=None, background=(0.25, 0, 1))
+        assert bare.depth is None
+        assert_equal(bare, shapes[index], (1,), background=(0.25, 0, 1), side=None)
+        assert shards.metadata(index).seed == index
+        assert shards.metadata(index).source == "test"
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # theirs leaves files open
+def test_others_read_it(tmp_path):
+    shapes = write_set(tmp_path, shards=1)
+    count = 0
+    reader = webdataset.WebDataset(str(tmp_path / "set-000000.tar"), shardshuffle=False)
+    for number, (found, shape) in enumerate(zip(reader, shapes, strict=True)):
+        assert found["__key__"] == f"{number:08d}"
+        metadata = json.loads(found["json"])
+        assert (metadata["name"], metadata["category"], metadata["split"]) == shape[:3]
+        assert (metadata["key"], metadata["seed"], metadata["source"]) == (f"{number:08d}", number, "test")
+        assert (metadata["views"], metadata["size"], metadata["voxels"]) == (3, [12, 16], [8, 16])
+        np.testing.assert_array_equal(metadata["cameras"]["intrinsics"], shape.K)
+        np.testing.assert_array_equal(metadata["cameras"]["cam_from_world"], shape.E)
+        for view in range(3):
+            picture = np.array(Image.open(io.BytesIO(found[f"{view:02d}.png"])))
+            np.testing.assert_array_equal(picture[..., :3], shape.pixels[view])
+            np.testing.assert_array_equal(picture[..., 3], 255 * shape.mask[view])
+            depth = np.array(Image.open(io.BytesIO(found[f"{view:02d}.depth.png"])))
+            np.testing.assert_array_equal(depth, shape.steps[view])
+        for side, grid in shape.grids.items():
+            packed = np.load(io.BytesIO(found[f"vox{side}.npy"]))
+            np.testing.assert_array_equal(np.unpackbits(packed, axis=-1), grid)
+        count += 1
+    assert count == 3
+    del reader, found
+    gc.collect()
+
+
+def test_headers_hold_names_and_sizes_alone(tmp_path):
+    write_set(tmp_path, shards=1)
+    with tarfile.open(tmp_path / "set-000000.tar") as tar:
+        for info in tar.getmembers():
+            assert info.isreg()
+            assert (info.mtime, info.uid, info.gid, info.uname, info.gname, info.mode) == (0, 0, 0, "", "", 0o644)
+        first = tar.getnames()[:9]
+    views = [f"{view:02d}{kind}.png" for view in range(3) for kind in ("", ".depth")]
+    assert first == [f"00000000.{suffix}" for suffix in ("json", *views, "vox8.npy", "vox16.npy")]
+
+
+def test_the_same_content_gives_the_same_bytes(tmp_path):
+    write_set(tmp_path / "a")
+    write_set(tmp_path / "b")
+    for name in NAMES:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_depth_is_off_by_half_a_step(tmp_path):
+    shape = make_shape(0)
+    rng = np.random.default_rng(5)
+    depth = rng.uniform(1.0, 3.2, shape.mask.shape).astype(np.float32) * shape.mask
+    depth[0, 0, 0] = 1e-9  # seen, however near
+    sample = shape.sample()._replace(depth=torch.from_numpy(depth), mask=None)
+    write_shard(tmp_path / "a.tar", [(0, encode_sample(sample, 0))], SETTINGS)
+    read = ShardSet(tmp_path).read(0, occupancy=8)
+    expected = np.where(depth == np.float32(1e-9), np.float32(STEP), depth)
+    np.testing.assert_allclose(read.depth.numpy(), expected, rtol=0, atol=0.5 * STEP + 1e-6)
+    np.testing.assert_array_equal(read.depth.numpy() > 0, depth > 0)
+    np.testing.assert_array_equal(read.mask.numpy(), depth > 0)  # where there is depth, there is the object
+
+
+def test_a_sample_of_images_alone(tmp_path):
+    sample = make_shape(0).sample()._replace(depth=None, mask=None, occupancy=None, mesh=None, category=None)
+    members = encode_sample(sample, "00000007")
+    assert list(members) == ["json", "00.png", "01.png", "02.png"]
+    write_shard(tmp_path / "a.tar", [(7, members)], SETTINGS)
+    shards = ShardSet(tmp_path)
+    read = shards.read(0, depth=False, occupancy=None)
+    assert read.mask.all()
+    torch.testing.assert_close(read.images, sample.images, rtol=0, atol=0)
+    assert (read.mesh, read.category, shards.splits) == (None, None, [None])
+    with pytest.raises(DataError, match="has no depth; read it with depth=False"):
+        shards.read(0, occupancy=None)
+    with pytest.raises(DataError, match="no occupancy of int 32 voxels; it has none"):
+        shards.read(0, depth=False)
+
+
+SAMPLE = make_shape(0).sample()
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "error", "match"),
+    [
+        ({"images": SAMPLE.images + 0.1}, {}, OptionError, r"images must be in \[0, 1\]"),
+        ({"images": SAMPLE.images * torch.nan}, {}, OptionError, r"images must be in \[0, 1\]; got \[nan"),
+        ({"depth": -SAMPLE.depth}, {}, OptionError, "depth must be in"),
+        ({"depth": SAMPLE.depth * torch.nan}, {}, OptionError, "depth must be in"),
+        ({"depth": SAMPLE.depth + 4}, {}, OptionError, "depth_step = 3.27675"),
+        ({"depth": SAMPLE.depth * torch.inf}, {}, OptionError, "depth must be in"),
+        ({}, {"depth_step": 0}, OptionError, "depth_step must be a positive"),
+        ({}, {"depth_step": "x"}, OptionError, "depth_step must be a positive"),
+        ({}, {"more_occupancy": [SAMPLE.occupancy]}, OptionError, "two occupancy grids of 8"),
+        ({}, {"more_occupancy": [SAMPLE.occupancy[:4]]}, ShapeError, r"\(n, n, n\)"),
+        ({}, {"more_occupancy": [torch.ones(4, 4, 4)]}, DTypeError, "bool tensors"),
+        ({}, {"seed": -1}, OptionError, "seed must be"),
+        ({}, {"split": ""}, OptionError, "split must be"),
+        ({"name": "a\nb"}, {}, OptionError, "name must be 1 to 1024 printable"),
+        ({"cameras": SAMPLE.cameras._replace(intrinsics=-SAMPLE.cameras.intrinsics)}, {}, CameraError, "last row"),
+    ],
+)
+def test_what_is_not_encoded(change, options, error, match):
+    assert "json" in encode_sample(SAMPLE, 3)
+    with pytest.raises(error, match=match):
+        encode_sample(SAMPLE._replace(**change), 3, **options)
+
+
+@pytest.mark.parametrize("key", [-1, 10**8, "1", "0000000x", True, None, "0000000\u0661"])
+def test_keys_are_eight_digits(key):
+    with pytest.raises(OptionError, match="key must be"):
+        encode_sample(SAMPLE, key)
+
+
+def test_what_is_no_shard(tmp_path):
+    members = encode_sample(SAMPLE, 0)
+    path = tmp_path / "a.tar"
+    for wrong, error, match in (
+        ([], OptionError, "no shape to write"),
+        ([(0, members), (0, members)], OptionError, "a key comes twice"),
+        ([(1, members)], OptionError, "belongs to key"),
+        ([(0, {**members, "../x": b""})], OptionError, "must be those of encode_sample"),
+        ([(0, dict(reversed(members.items())))], OptionError, "json first"),
+        ([(0, {**members, "json": b"{"})], OptionError, "is not JSON"),
+    ):
+        with pytest.raises(error, match=match):
+            write_shard(path, wrong, SETTINGS)
+    for name in ("a.zip", ".a.tar"):
+        with pytest.raises(DataError, match="must end in"):
+            write_shard(tmp_path / name, [(0, members)], SETTINGS)
+    for settings in ("", 3, "x" * 200):
+        with pytest.raises(OptionError, match="settings_hash must be"):
+            write_shard(path, [(0, members)], settings)
+    with pytest.raises(OptionError, match="JSON can hold"):
+        hash_settings({"views": torch.ones(1)})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_shapes_are_written_one_at_a_time(tmp_path):
+    """When the next shape is asked for, the one before is on its way to the disk, and nothing else is kept."""
+    members = [encode_sample(SAMPLE._replace(name=str(key)), key) for key in range(40)]
+    sizes = []
+
+    def items():
+        for key, content in enumerate(members):
+            (temporary,) = tmp_path.glob(".a.tar.*.tmp")
+            sizes.append(temporary.stat().st_size)
+            yield key, content
+
+    write_shard(tmp_path / "a.tar", items(), SETTINGS)
+    each = sum(map(len, members[0].values()))
+    written = np.diff(sizes)
+    assert sizes[-1] > 35 * each
+    assert written.max() < 3 * each + io.DEFAULT_BUFFER_SIZE
+
+
+def test_errors_of_the_shapes_pass_unchanged(tmp_path):
+    def items():
+        yield 0, encode_sample(SAMPLE, 0)
+        raise FileNotFoundError("mesh.obj")
+
+    with pytest.raises(FileNotFoundError, match="mesh"):
+        write_shard(tmp_path / "a.tar", items(), SETTINGS)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_told(tmp_path, monkeypatch):
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files.os, "fsync", full)
+    with pytest.raises(DataError, match=r"a.tar: cannot be written .*No space left"):
+        write_shard(tmp_path / "a.tar", [(0, encode_sample(SAMPLE, 0))], SETTINGS)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_verifying(tmp_path):
+    write_set(tmp_path, shards=1)
+    path, sidecar = tmp_path / NAMES[1], tmp_path / NAMES[0]
+    content, index = path.read_bytes(), sidecar.read_bytes()
+    assert verify_shard(path, SETTINGS) is True
+    assert verify_shard(path, hash_settings({"made": "otherwise"})) is False
+    assert verify_shard(tmp_path / "other.tar", SETTINGS) is False
+    rng = np.random.default_rng(0)
+    for position in rng.integers(len(content), size=60):
+        flipped = bytearray(content)
+        flipped[position] ^= 1 << int(rng.integers(8))
+        path.write_bytes(flipped)
+        assert verify_shard(path, SETTINGS) is False
+    for length in (0, 1, 511, 512, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:length])
+        assert verify_shard(path, SETTINGS) is False
+        with pytest.raises(DataError, match=r"set-000000.json: tells of"):
+            ShardSet(tmp_path)
+    path.write_bytes(content)
+    for length in (0, 1, len(index) // 2, len(index) - 2):
+        sidecar.write_bytes(index[:length])
+        assert verify_shard(path, SETTINGS) is False
+        with pytest.raises(DataError, match=r"set-000000.json: is not JSON"):
+            ShardSet(tmp_path)
+    sidecar.unlink()
+    assert verify_shard(path, SETTINGS) is False
+
+
+def read_all(folder):
+    shards = ShardSet(folder)
+    return [shards.read(index, occupancy=16) for index in range(len(shards))]
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_damage_in_a_member_is_told_or_does_not_matter(tmp_path, indexed):
+    """Every flipped bit gives a DataError that names the tar, or (in padding and the like) what was written.
+
+    Without a sidecar there are no check sums of occupancy and json: there the values may change, within their rules.
+    """
+    shapes = write_set(tmp_path, shards=1)
+    path = tmp_path / NAMES[1]
+    content = path.read_bytes()
+    if not indexed:
+        (tmp_path / NAMES[0]).unlink()
+    rng = np.random.default_rng(1)
+    told = failures = 0
+    for position in rng.integers(len(content), size=150):
+        flipped = bytearray(content)
+        flipped[position] ^= 1 << int(rng.integers(8))
+        path.write_bytes(flipped)
+        try:
+            samples = read_all(tmp_path)
+        except DataError as error:
+            failures += 1
+            told += str(path) in str(error)
+            continue
+        for sample, shape in zip(samples, shapes, strict=True):
+            if indexed:
+                assert_equal(sample, shape, range(3), side=16)
+            else:
+                assert sample.images.shape == (3, 3, 12, 16)
+    assert told == failures
+    assert told > (20 if indexed else 10)
+
+
+def test_a_shard_without_a_sidecar_is_indexed_from_its_headers(tmp_path):
+    shapes = write_set(tmp_path)
+    (tmp_path / NAMES[0]).unlink()
+    shards = ShardSet(tmp_path)
+    assert shards.categories == [shape.category for shape in shapes]
+    assert shards.splits == [shape.split for shape in shapes]
+    for index, shape in enumerate(shapes):
+        assert_equal(shards.read(index, occupancy=8), shape, range(3))
+    assert sorted(os.listdir(tmp_path)) == NAMES[1:]
+
+
+def test_a_shard_of_another_tar_program(tmp_path):
+    """Other headers, other order, extended headers: what a tar program makes of the unpacked members."""
+    shapes = write_set(tmp_path / "ours", shards=1)
+    with tarfile.open(tmp_path / "ours" / NAMES[1]) as tar:
+        members = [(info.name, tar.extractfile(info).read()) for info in tar.getmembers()]
+    with tarfile.open(tmp_path / "b.tar", "w", format=tarfile.PAX_FORMAT) as tar:
+        for name, content in sorted(members):
+            info = tarfile.TarInfo(name)
+            info.size, info.mtime, info.uname = len(content), 1234.5, "some one"
+            tar.addfile(info, io.BytesIO(content))
+    shards = ShardSet(tmp_path)
+    for index, shape in enumerate(shapes):
+        assert_equal(shards.read(index, occupancy=8), shape, range(3))
+
+
+def test_only_what_is_asked_for_is_read(tmp_path, monkeypatch):
+    write_set(tmp_path, shards=1)
+    shards = ShardSet(tmp_path)
+    names = []
+    fetch = ShardSet._fetch
+
+    def listing(self, number, member):
+        names.append(member.name)
+        return fetch(self, number, member)
+
+    monkeypatch.setattr(ShardSet, "_fetch", listing)
+    shards.read(1, views=[2], depth=False, occupancy=None)
+    assert names == ["00000001.json", "00000001.02.png"]
+
+
+def test_sets_go_to_other_processes(tmp_path):
+    shapes = write_set(tmp_path)
+    shards = ShardSet(tmp_path)
+    assert_equal(shards.read(4, occupancy=8), shapes[4], range(3))
+    assert_equal(pickle.loads(pickle.dumps(shards)).read(4, occupancy=8), shapes[4], range(3))
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            assert_equal(shards.read(4, occupancy=8), shapes[4], range(3))
+            assert_equal(shards.read(0, occupancy=8), shapes[0], range(3))
+            status = 0
+        finally:
+            os._exit(status)
+    assert os.waitpid(child, 0)[1] == 0
+    assert_equal(shards.read(5, occupancy=8), shapes[5], range(3))
+
+
+def test_few_files_are_open_at_a_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(shard_reading, "OPEN_FILES", 2)
+    shapes = write_set(tmp_path, shards=5, each=1)
+    shards = ShardSet(tmp_path)
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(2):
+        for index, shape in enumerate(shapes):
+            assert_equal(shards.read(index, occupancy=8), shape, range(3))
+            assert len(os.listdir("/proc/self/fd")) <= before + 2
+
+
+def test_a_shard_that_changes_is_noticed(tmp_path):
+    write_set(tmp_path, shards=1)
+    shards = ShardSet(tmp_path)
+    with (tmp_path / NAMES[1]).open("ab") as stream:
+        stream.write(b"\0")
+    with pytest.raises(DataError, match="has changed since"):
+        shards.read(0, occupancy=8)
+    (tmp_path / NAMES[1]).unlink()
+    with pytest.raises(DataError, match="cannot be read"):
+        shards.read(0, occupancy=8)
+
+
+@pytest.mark.parametrize(
+    ("index", "options", "match"),
+    [
+        (6, {}, "index must be an integer from 0 to 5"),
+        (-1, {}, "index must be"),
+        ("a", {}, "index must be"),
+        (0, {"views": []}, "views must be numbers from 0 to 2"),
+        (0, {"views": [3]}, "views must be"),
+        (0, {"views": [0.5]}, "views must be"),
+        (0, {"views": 3}, "views must be"),
+        (0, {"depth": 1}, "depth must be True or False"),
+        (0, {"background": (0, 1)}, "background must be"),
+        (0, {"background": (0, 1, 2)}, "background must be"),
+        (0, {"background": 7}, "background must be"),
+        (0, {"background": "random"}, "needs a generator"),
+    ],
+)
+def test_what_is_not_read(tmp_path, index, options, match):
+    write_set(tmp_path)
+    with pytest.raises(OptionError, match=match):
+        ShardSet(tmp_path).read(index, **{"occupancy": 8, **options})
+
+
+def test_backgrounds_from_a_folder(tmp_path):
+    shapes = write_set(tmp_path / "set", shards=1)
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    v, u = np.mgrid[:30, :50].astype(np.uint8)
+    Image.fromarray(np.stack([4 * u, 4 * v, np.full_like(u, 9)], -1)).save(pictures / "ramp.png")
+    (pictures / "notes.txt").write_text("no picture")
+    shards = ShardSet(tmp_path / "set")
+
+    def read(seed):
+        return shards.read(1, occupancy=8, background=pictures, generator=np.random.default_rng(seed))
+
+    sample = read(0)
+    assert torch.equal(sample.images, read(0).images)
+    assert not torch.equal(sample.images, read(1).images)
+    images, mask = 255 * sample.images.numpy(), shapes[1].mask
+    np.testing.assert_array_equal(images.transpose(0, 2, 3, 1)[mask].round(), shapes[1].pixels[mask])
+    for image, inside in zip(images, mask, strict=True):
+        # A cutting of the ramp, scaled: red grows to the right, green downwards, between 1 and 2 source pixels a pixel.
+        np.testing.assert_allclose(image[2][~inside], 9, atol=0.01)
+        for values, axis in ((image[0], 1), (image[1], 0)):
+            steps = np.diff(values, axis=axis)[1:-1, 1:-1]
+            outside = ~(inside[1:, :] | inside[:-1, :] if axis == 0 else inside[:, 1:] | inside[:, :-1])[1:-1, 1:-1]
+            assert 3 <= steps[outside].mean() <= 11
+    (pictures / "ramp.png").write_bytes(b"GIF89a")
+    with pytest.raises(DataError, match="not a readable PNG"):
+        read(0)
+    (pictures / "ramp.png").unlink()
+    with pytest.raises(DataError, match="holds no PNG or JPEG"):
+        read(0)
+    with pytest.raises(DataError, match="is no folder of backgrounds"):
+        shards.read(0, background="whlte", occupancy=8)
+
+
+def test_names_are_unique_in_a_set(tmp_path):
+    for shard in range(2):
+        write_shard(tmp_path / f"{shard}.tar", [(shard, encode_sample(SAMPLE, shard))], SETTINGS)
+    with pytest.raises(DataError, match=r"two shapes are named 'shape-0', in 0.tar and 1.tar"):
+        ShardSet(tmp_path)
+
+
+@pytest.mark.parametrize("kind", [RGBA, DEPTH])
+def test_pictures_of_other_writers(kind):
+    shape = (37, 29, 4) if kind is RGBA else (37, 29)
+    rng = np.random.default_rng(0)
+    smooth = np.cumsum(rng.integers(0, 3, shape), axis=1) * (1 if kind is RGBA else 300)
+    pixels = smooth.astype(kind.dtype)
+    ours = encode_png(pixels)
+    np.testing.assert_array_equal(np.array(Image.open(io.BytesIO(ours))), pixels)
+    written = [ours]
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "PNG")
+    written.append(stream.getvalue())
+    filters = (cv2.IMWRITE_PNG_FILTER_NONE, cv2.IMWRITE_PNG_FILTER_SUB, cv2.IMWRITE_PNG_FILTER_UP,
+               cv2.IMWRITE_PNG_FILTER_AVG, cv2.IMWRITE_PNG_FILTER_PAETH, cv2.IMWRITE_PNG_ALL_FILTERS)  # fmt: skip
+    for row_filter in filters:
+        swapped = cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA) if kind is RGBA else pixels
+        written.append(cv2.imencode(".png", swapped, [cv2.IMWRITE_PNG_FILTER, row_filter])[1].tobytes())
+    for content in written:
+        np.testing.assert_array_equal(decode_png(content, (37, 29), kind, "memory"), pixels)
+    with pytest.raises(ValueError, match="pixels must be"):
+        encode_png(pixels.astype(np.float32))
+
+
+class Stops:
+    """Counts the steps at which a writer touches the disk, and kills its process at one of them."""
+
+    def __init__(self, monkeypatch, at=None):
+        self.count, self.at = 0, at
+        for owner, name in ((files.AtomicFile, "write"), (files.os, "fsync"), (Path, "replace"), (Path, "chmod"),
+                            (Path, "unlink")):  # fmt: skip
+            monkeypatch.setattr(owner, name, self.wrapped(getattr(owner, name)))
+
+    def wrapped(self, function):
+        def run(*arguments, **options):
+            self.step()
+            result = function(*arguments, **options)
+            self.step()
+            return result
+
+        return run
+
+    def step(self):
+        if self.count == self.at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        self.count += 1
+
+
+@pytest.mark.parametrize("before", ["nothing", "other"])
+def test_a_killed_writer_leaves_no_half_shard(tmp_path, monkeypatch, before):
+    shape, other = make_shape(0, views=1), make_shape(1, views=1)
+    items = [(0, shape.members(0))]
+    expected = tmp_path / "expected"
+    with monkeypatch.context() as patch:
+        stops = Stops(patch)
+        write_shard(expected / "a.tar", items, SETTINGS)
+    assert stops.count > 30
+    for at in range(stops.count):
+        folder = tmp_path / str(at)
+        path = folder / "a.tar"
+        folder.mkdir()
+        if before == "other":
+            write_shard(path, [(0, other.members(0))], "other settings")
+        child = os.fork()
+        if child == 0:
+            try:
+                Stops(monkeypatch, at)
+                write_shard(path, items, SETTINGS)
+            finally:
+                os._exit(0)
+        assert os.waitpid(child, 0)[1] == signal.SIGKILL
+        # What is there is whole: the old shard, the new one, or none.
+        done = verify_shard(path, SETTINGS)
+        if path.exists():
+            read = ShardSet(folder).read(0, occupancy=8)
+            assert_equal(read, shape if read.name == shape.name else other, range(1))
+            assert read.name == shape.name or not done
+        else:
+            assert before == "nothing"
+            assert not done
+        write_shard(path, items, SETTINGS)
+        assert verify_shard(path, SETTINGS)
+        assert sorted(os.listdir(folder)) == ["a.json", "a.tar"]
+        for name in ("a.json", "a.tar"):
+            assert (folder / name).read_bytes() == (expected / name).read_bytes()

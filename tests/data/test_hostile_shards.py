@@ -1,0 +1,449 @@
+"""Shards, sidecars and pictures that lie: a DataError that names the file, little memory, nothing written anywhere."""
+
+import io
+import json
+import os
+import struct
+import tarfile
+import zlib
+
+import numpy as np
+import pytest
+
+from lsmgeo.data import ShardSet
+from lsmgeo.data.png import DEPTH, RGBA, decode_png, encode_png
+from lsmgeo.errors import DataError
+from tests.data.shapes import write_set
+from tests.fuzz import forked
+
+TAR, SIDECAR = "set-000000.tar", "set-000000.json"
+pytestmark = pytest.mark.timeout(120)
+
+
+def read_all(folder):
+    shards = ShardSet(folder)
+    samples = [shards.read(index, occupancy=8) for index in range(len(shards))]
+    for sample in samples:
+        assert all(tensor.isfinite().all() for tensor in (sample.images, sample.depth, *sample.cameras[:2]))
+    return samples
+
+
+def refused(folder, match, file):
+    with pytest.raises(DataError, match=match) as caught:
+        read_all(folder)
+    assert str(caught.value.path) == str(folder / file)
+    assert str(folder / file) in str(caught.value)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_set(tmp_path, shards=1, each=2, views=2)
+    return tmp_path
+
+
+@pytest.fixture
+def index(folder):
+    return json.loads((folder / SIDECAR).read_text())
+
+
+def entry(index, **fields):
+    index["entries"][0].update(fields)
+
+
+SIDECARS = {
+    "another format": (lambda i: i.update(format="x"), "is not the index of a shard"),
+    "a newer version": (lambda i: i.update(version=2), "has version int 2"),
+    "another tar": (lambda i: i.update(tar="../set-000000.tar"), "tells of"),
+    "another size": (lambda i: i.update(bytes=2**70), "tells of"),
+    "no size": (lambda i: i.pop("bytes"), "lacks 'bytes'"),
+    "settings of any kind": (lambda i: i.update(settings=[1]), "settings must be"),
+    "a long hash": (lambda i: i.update(sha256="0" * 65), "sha256 must be"),
+    "no entries": (lambda i: i.update(entries=[], shapes=0), "1 to 10000 entries"),
+    "many entries": (lambda i: i.update(entries=[{}] * 10_001, shapes=10_001), "1 to 10000 entries"),
+    "a wrong count": (lambda i: i.update(shapes=3), "as many as it announces"),
+    "an entry of any kind": (lambda i: i.update(entries=[1, 2]), "an entry must be an object"),
+    "a path for a key": (lambda i: entry(i, key="../../x"), "eight digits"),
+    "a long key": (lambda i: entry(i, key="0" * 9), "eight digits"),
+    "a key twice": (lambda i: entry(i, key="00000001"), "uses a key twice"),
+    "a name twice": (lambda i: entry(i, name="shape-1"), "uses a name twice"),
+    "a long name": (lambda i: entry(i, name="x" * 2000), "name of 00000000 must be"),
+    "another name": (lambda i: entry(i, name="other"), None),
+    "a category of any kind": (lambda i: entry(i, category=["chair"]), "category of 00000000 must be"),
+    "no such layout": (lambda i: entry(i, layout=1), "layout of 00000000 must be"),
+    "a negative layout": (lambda i: entry(i, layout=-1), "layout of 00000000 must be"),
+    "a suffix that leads away": (lambda i: i.update(layouts=[["json", "../x.png"]]), "list of suffixes"),
+    "a suffix twice": (lambda i: i.update(layouts=[["json", "json"]]), "no suffix twice"),
+    "layouts of any kind": (lambda i: i.update(layouts={"a": 1}), "layouts must be a list"),
+    "few offsets": (lambda i: i["entries"][0]["offsets"].pop(), "must be 7 whole numbers"),
+    "a fraction": (lambda i: i["entries"][0]["offsets"].__setitem__(2, 0.5), "float"),
+    "text": (lambda i: i["entries"][0]["sizes"].__setitem__(2, "1"), "str"),
+    "a huge number": (lambda i: i["entries"][0]["sizes"].__setitem__(2, 2**80), "too large|too big|long"),
+    "a negative size": (lambda i: i["entries"][0]["sizes"].__setitem__(2, -1), "outside the"),
+    "a huge size": (lambda i: i["entries"][0]["sizes"].__setitem__(2, 2**62), "outside the"),
+    "an offset beyond": (lambda i: i["entries"][0]["offsets"].__setitem__(2, 2**62), "outside the"),
+    "an offset in the header": (lambda i: i["entries"][0]["offsets"].__setitem__(0, 0), "outside the"),
+    "overlapping members": (lambda i: i["entries"][0]["sizes"].__setitem__(0, 4000), "members overlap"),
+}
+
+
+@pytest.mark.parametrize("name", SIDECARS)
+def test_sidecars_are_checked(folder, index, name):
+    change, match = SIDECARS[name]
+    change(index)
+    (folder / SIDECAR).write_text(json.dumps(index))
+    if match is None:
+        refused(folder, "names 'shape-0', the index 'other'", TAR)
+    else:
+        refused(folder, match, SIDECAR)
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [(b"", "not JSON"), (b"\xff\xfe", "not JSON"), (b"[" * 100_000, "not JSON"), (b"[]", "not the index"),
+     (b'{"version":' + b"9" * 100_000 + b"}", "not JSON"), (bytes((1 << 24) + 1), "larger than the limit"),
+     (b"null", "not the index")],
+)  # fmt: skip
+def test_sidecars_of_other_content(folder, content, match):
+    (folder / SIDECAR).write_bytes(content)
+    refused(folder, match, SIDECAR)
+
+
+def test_a_sidecar_of_other_places_is_noticed(folder, index):
+    offsets = index["entries"][0]["offsets"]
+    offsets[1], offsets[2] = offsets[2], offsets[1]
+    sizes = index["entries"][0]["sizes"]
+    sizes[1] = sizes[2] = min(sizes[1:3])
+    (folder / SIDECAR).write_text(json.dumps(index))
+    refused(folder, "is not where the index says", TAR)
+
+
+@pytest.mark.parametrize("name", [TAR, SIDECAR])
+def test_links_and_pipes(folder, tmp_path_factory, name):
+    outside = tmp_path_factory.mktemp("outside")
+    (folder / name).rename(outside / name)
+    os.mkfifo(folder / name)
+    refused(folder, "no such file", name)
+    (folder / name).unlink()
+    (folder / name).symlink_to(outside / name)
+    if name == TAR:
+        with pytest.raises(DataError, match="outside its folder"):
+            read_all(folder)
+    else:
+        assert len(read_all(folder)) == 2  # content is checked, wherever it lies
+    (folder / name).unlink()
+    (folder / name).mkdir()
+    refused(folder, "no such file", name)
+
+
+def test_folders_without_shards(tmp_path):
+    for path, match in (
+        (tmp_path, "holds no shard"),
+        (tmp_path / "x", "cannot be read"),
+        (tmp_path / "a\0b", "cannot"),
+    ):
+        with pytest.raises(DataError, match=match):
+            ShardSet(path)
+
+
+def header(name, size, kind=tarfile.REGTYPE, link=""):
+    info = tarfile.TarInfo(name)
+    info.size, info.type, info.linkname = size, kind, link
+    return info.tobuf(tarfile.GNU_FORMAT)
+
+
+def block(content):
+    return content + bytes(-len(content) % 512)
+
+
+END = bytes(1024)
+TARS = {
+    "nothing": (b"", "damaged tar header at byte 0"),
+    "an empty tar": (bytes(10240), "must hold 1 to 10000 shapes; got 0"),
+    "no tar": (b"x" * 2048, "damaged tar header at byte 0"),
+    "half a header": (header("00000000.json", 2)[:300], "damaged tar header at byte 0"),
+    "a size beyond the file": (header("00000000.json", 2**33), "announces 8589934592 bytes"),
+    "a negative size": (header("00000000.json", -1), "announces -1 bytes"),
+    "a path": (header("../00000000.json", 0) + END, "no member of a shape"),
+    "a path from the root": (header("/00000000.json", 0) + END, "no member of a shape"),
+    "a name with a path in it": (header("00000000./../json", 0) + END, "no member of a shape"),
+    "another file": (header("readme.txt", 0) + END, "no member of a shape"),
+    "a link": (header("00000000.json", 0, tarfile.SYMTYPE, "/etc/passwd"), "something else than regular files"),
+    "a hard link": (header("00000000.json", 0, tarfile.LNKTYPE, "00000000.00.png"), "something else"),
+    "a device": (header("00000000.json", 0, tarfile.CHRTYPE), "something else than regular files"),
+    "a folder": (header("00000000.json", 0, tarfile.DIRTYPE), "something else than regular files"),
+    "a sparse file": (header("00000000.json", 0, tarfile.GNUTYPE_SPARSE), "something else than regular files"),
+    "a long name": (header("x", 600, tarfile.GNUTYPE_LONGNAME) + block(b"y" * 600), "something else"),
+    "a long extension": (header("x", 1 << 17, tarfile.XHDTYPE) + bytes(1 << 17), "something else than regular files"),
+    "no json": (header("00000000.00.png", 0) + END, "holds no 00000000.json"),
+    "a member twice": (2 * header("00000000.json", 0) + END, "holds 00000000.json twice"),
+    "no end": (header("00000000.json", 2) + block(b"{}"), "damaged tar header at byte 1024"),
+    "an empty json": (header("00000000.json", 0) + bytes(1024), "is not JSON"),
+}
+
+
+@pytest.mark.parametrize("name", TARS)
+def test_tars_are_checked(tmp_path, name):
+    content, match = TARS[name]
+    (tmp_path / TAR).write_bytes(content)
+    refused(tmp_path, match, TAR)
+
+
+def rewritten(folder, change):
+    """The shard without its sidecar, members changed by ``change(members)``."""
+    (folder / SIDECAR).unlink()
+    with tarfile.open(folder / TAR) as tar:
+        members = {info.name: tar.extractfile(info).read() for info in tar.getmembers()}
+    change(members)
+    with tarfile.open(folder / TAR, "w", format=tarfile.USTAR_FORMAT) as tar:
+        for name, content in members.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            tar.addfile(info, io.BytesIO(content))
+
+
+def changed_json(change):
+    def apply(members):
+        values = json.loads(members["00000000.json"])
+        change(values)
+        members["00000000.json"] = json.dumps(values).encode()
+
+    return apply
+
+
+def matrix(values, name, row, column, value):
+    values["cameras"][name][1][row][column] = value
+
+
+JSONS = {
+    "another key": (lambda v: v.update(key="00000001"), "belongs to key"),
+    "no name": (lambda v: v.update(name=None), "name must be a string"),
+    "a name of any kind": (lambda v: v.update(name=["a"]), "name must be"),
+    "a name of two lines": (lambda v: v.update(name="a\nb"), "name must be"),
+    "a name that is another's": (lambda v: v.update(name="shape-1"), "uses a name twice"),
+    "no views": (lambda v: v.update(views=0), "views: expected a whole number"),
+    "many views": (lambda v: v.update(views=2**40), "views: expected a whole number"),
+    "other views": (lambda v: v.update(views=3), "must be 3 matrices"),
+    "a view less": (lambda v: (v.update(views=1), [m.pop() for m in v["cameras"].values()]), "tells of 1 views"),
+    "an impossible size": (lambda v: v.update(size=[12, 10**9]), "size: expected a whole number"),
+    "another size": (lambda v: v.update(size=[4096, 4096]), "is 16 x 12 pixels .* expected 4096 x 4096"),
+    "a size of any kind": (lambda v: v.update(size="12x16"), r"size must be \[height, width\]"),
+    "a step of nothing": (lambda v: v.update(depth_step=0), "depth_step must be"),
+    "a huge step": (lambda v: v.update(depth_step=1e300), "depth_step must be"),
+    "no step": (lambda v: v.update(depth_step=None), "has no depth"),
+    "a negative seed": (lambda v: v.update(seed=-1), "seed: expected"),
+    "voxels of any kind": (lambda v: v.update(voxels=8), "voxels must be a list"),
+    "many voxels": (lambda v: v.update(voxels=[10**6]), "voxels: expected"),
+    "other voxels": (lambda v: v.update(voxels=[32]), "no occupancy of int 8 voxels; it has 32"),
+    "no cameras": (lambda v: v.pop("cameras"), "lacks 'cameras'"),
+    "cameras of any kind": (lambda v: v.update(cameras=[]), "cameras must be an object"),
+    "a ragged camera": (lambda v: v["cameras"]["intrinsics"][1][1].pop(), "matrices of 3 x 3"),
+    "a camera of text": (lambda v: matrix(v, "intrinsics", 0, 0, "1"), "matrices of 3 x 3"),
+    "a camera of huge numbers": (lambda v: matrix(v, "intrinsics", 0, 0, 10**400), "too large"),
+    "a camera of infinity": (lambda v: matrix(v, "intrinsics", 0, 0, float("inf")), "is not JSON .*Infinity"),
+    "a camera without focal length": (lambda v: matrix(v, "intrinsics", 0, 0, 0), "focal lengths must be positive"),
+    "a camera that is not rigid": (lambda v: matrix(v, "cam_from_world", 0, 0, 3.0), "rotation must be orthonormal"),
+}
+
+
+@pytest.mark.parametrize("name", JSONS)
+def test_jsons_are_checked(folder, name):
+    change, match = JSONS[name]
+    rewritten(folder, changed_json(change))
+    refused(folder, match, TAR)
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [(b"\xff", "not JSON"), (b"[" * 100_000, "not JSON"), (b"[]", "expected an object"), (b"{}", "lacks 'key'"),
+     (b" " * ((1 << 22) + 1), "larger than the limit")],
+)  # fmt: skip
+def test_jsons_of_other_content(folder, content, match):
+    rewritten(folder, lambda members: members.update({"00000000.json": content}))
+    refused(folder, f"00000000.json:? .*{match}", TAR)
+
+
+def npy(array, version=(1, 0)):
+    stream = io.BytesIO()
+    np.lib.format.write_array(stream, array, version)
+    return stream.getvalue()
+
+
+def npy_header(text):
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()
+
+
+GRID = np.zeros((8, 8, 1), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        (b"", "not an array file"),
+        (b"PK\x03\x04" + bytes(100), "not an array file"),
+        (npy(GRID)[:-1], "holds 63 bytes of data"),
+        (npy(GRID) + b"\0", "holds 65 bytes of data"),
+        (npy(GRID, (2, 0)), "version is not 1.0"),
+        (npy(np.zeros((16, 16, 2), np.uint8)), r"expected \(8, 8, 1\)"),
+        (npy(np.zeros((8, 8, 1), np.float64)), r"expected \(8, 8, 1\)"),
+        (npy(np.asfortranarray(np.zeros((8, 8, 2), np.uint8))[..., :1]), r"expected \(8, 8, 1\)"),
+        (npy_header("{'descr': '|u1', 'fortran_order': False, 'shape': (100000, 100000, 9), }\n"), "expected"),
+        (npy_header("{'descr': '|O', 'fortran_order': False, 'shape': (8, 8, 1), }\n"), "expected"),
+        (npy_header("(" * 60000), "not an array file"),
+        (npy_header("__import__('os').system('touch pwned')"), "not an array file"),
+    ],
+)
+def test_arrays_are_checked(folder, content, match):
+    rewritten(folder, lambda members: members.update({"00000000.vox8.npy": content}))
+    refused(folder, match, TAR)
+    assert not os.path.exists("pwned")
+
+
+def chunk(kind, content, crc=None):
+    crc = zlib.crc32(kind + content) if crc is None else crc
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc)
+
+
+def png(width=16, height=12, bits=8, colour=6, interlace=0, data=None, before=b"", after=b""):
+    data = zlib.compress(bytes(height * (1 + 4 * width))) if data is None else data
+    start = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, interlace)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", start) + before + chunk(b"IDAT", data) + after + chunk(b"IEND", b"")
+
+
+PNGS = {
+    "nothing": (b"", "is not a PNG"),
+    "a JPEG": (b"\xff\xd8\xff\xe0" + bytes(64), "is not a PNG"),
+    "a signature": (png()[:8], "ends inside a PNG chunk"),
+    "half": (png()[:60], "ends inside a PNG chunk"),
+    "another size": (png(width=17), "is 17 x 12 pixels"),
+    "a huge size": (png(width=2**31 - 1, height=2**31 - 1, data=b""), "is 2147483647 x 2147483647 pixels"),
+    "16 bits": (png(bits=16), "has bit depth 16, colour type 6"),
+    "a palette": (png(colour=3), "has bit depth 8, colour type 3"),
+    "interlaced": (png(interlace=1), "interlacing 1"),
+    "little data": (png(data=zlib.compress(bytes(100))), "more or less data"),
+    "data without end": (png(data=zlib.compress(bytes(12 * 65))[:-4]), "more or less data"),
+    "a bomb": (png(data=zlib.compress(bytes(1 << 26), 9)), "more or less data"),
+    "no compression": (png(data=b"\0" * 100), "is a damaged picture"),
+    "an unknown filter": (png(data=zlib.compress(b"\5" * 12 * 65)), "an unknown filter"),
+    "a wrong check sum": (png(before=chunk(b"IDAT", b"", 1)), "a wrong check sum"),
+    "a palette beside": (png(before=chunk(b"PLTE", bytes(3))), "holds a PNG chunk b'PLTE'"),
+    "an animation": (png(before=chunk(b"acTL", bytes(8))), "holds a PNG chunk b'acTL'"),
+    "two headers": (png(before=png()[8:33]), "holds a PNG chunk b'IHDR'"),
+    "no header": (b"\x89PNG\r\n\x1a\n" + chunk(b"IEND", b""), "holds a PNG chunk b'IEND'"),
+    "a short header": (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", b"12"), "a PNG header of 2 bytes"),
+    "a chunk beyond the end": (png()[:33] + struct.pack(">I", 2**32 - 1) + b"IDAT" + bytes(16), "ends inside"),
+    "no data": (png()[:33] + chunk(b"IEND", b""), "more or less data"),
+    "more after the end": (png() + b"x", "1 bytes after its last PNG chunk"),
+}
+
+
+@pytest.mark.parametrize("name", PNGS)
+def test_pictures_are_checked(folder, name):
+    content, match = PNGS[name]
+    rewritten(folder, lambda members: members.update({"00000000.00.png": content}))
+    refused(folder, f"00000000.00.png: .*{match}", TAR)
+
+
+def test_a_valid_picture_made_by_hand_is_read(folder):
+    rewritten(folder, lambda members: members.update({"00000000.00.png": png()}))
+    assert not read_all(folder)[0].mask[0].any()
+
+
+def mutated(rng, content, fewest=1, most=4):
+    content = bytearray(content)
+    for _ in range(int(rng.integers(fewest, most + 1))):
+        kind, at = rng.integers(10), int(rng.integers(len(content)))
+        if kind == 0:
+            del content[at : at + int(rng.integers(1, 64))]
+        elif kind == 1:
+            content[at:at] = rng.integers(0, 256, int(rng.integers(1, 64)), np.uint8).tobytes()
+        elif kind == 2:
+            content[at] = rng.choice(np.frombuffer(b'\x00\xff0{}[],:"-', np.uint8))
+        else:
+            content[at] = int(rng.integers(256))
+        if not content:
+            break
+    return bytes(content)
+
+
+def judged(run):
+    try:
+        run()
+    except DataError:
+        return "refused"
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"[:300]
+    return "read"
+
+
+def listing(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+@pytest.mark.parametrize("what", ["sidecar", "tar", "json", "fitting sidecar"])
+def test_mutated_shards_are_refused_or_read(tmp_path, what):
+    """Beyond errors: no crash, no hang, no gigabytes, no other file."""
+    folder = tmp_path / "set"
+    write_set(folder, shards=1, each=1, views=1)
+    tar, sidecar = folder / TAR, folder / SIDECAR
+    content, index = tar.read_bytes(), sidecar.read_bytes()
+    values = json.loads(index)
+    assert values["layouts"][0][0] == "json"
+    offset, size = (values["entries"][0][column][0] for column in ("offsets", "sizes"))
+    if what in ("tar", "json"):
+        sidecar.unlink()
+    before = listing(tmp_path)
+
+    def judge(number):
+        rng = np.random.default_rng([number, len(what)])
+        if what == "sidecar":
+            sidecar.write_bytes(mutated(rng, index))
+        elif what == "tar":
+            tar.write_bytes(mutated(rng, content))
+        else:
+            # Bytes change in place, so that nothing before the json's own checks can refuse it.
+            text = bytearray(content[offset : offset + size])
+            for at in rng.integers(size, size=int(rng.integers(1, 4))):
+                text[at] = rng.choice(np.frombuffer(b'0123456789.-e,[]{}"naul', np.uint8))
+            tar.write_bytes(content[:offset] + bytes(text) + content[offset + size :])
+            if what == "fitting sidecar":
+                fitting = json.loads(index)
+                fitting["entries"][0]["crc32"][0] = zlib.crc32(text)
+                sidecar.write_text(json.dumps(fitting))
+        return judged(lambda: read_all(folder))
+
+    came = forked.outcomes(range(400), judge)
+    assert set(came) <= {"refused", "read"}
+    assert came.count("refused") > 100
+    assert listing(tmp_path) == before
+
+
+@pytest.mark.parametrize("kind", [RGBA, DEPTH])
+def test_mutated_pictures_are_refused_or_read(kind):
+    """With check sums made to fit, so that inflating and filters are reached."""
+    rng = np.random.default_rng(0)
+    shape = (12, 16, 4) if kind is RGBA else (12, 16)
+    pixels = np.cumsum(rng.integers(0, 3, shape), axis=1).astype(kind.dtype)
+    content = encode_png(pixels)
+    header, data = content[:33], content[41:-16]
+    raw = zlib.decompress(data)
+
+    def judge(number):
+        rng = np.random.default_rng([number, 7])
+        if number % 3 == 0:
+            damaged = mutated(rng, content)
+        elif number % 3 == 1:
+            damaged = header + chunk(b"IDAT", mutated(rng, data)) + chunk(b"IEND", b"")
+        else:
+            rows = np.frombuffer(raw, np.uint8).copy().reshape(12, -1)
+            rows[:, 0] = rng.integers(0, 5 + (number % 2), 12)  # any filters, half of the time one that does not exist
+            damaged = header + chunk(b"IDAT", zlib.compress(rows.tobytes())) + chunk(b"IEND", b"")
+
+        def run():
+            found = decode_png(damaged, (12, 16), kind, "memory")
+            assert (found.shape, found.dtype) == (shape, kind.dtype)
+
+        return judged(run)
+
+    came = forked.outcomes(range(600), judge)
+    assert set(came) == {"refused", "read"}
+    assert came.count("read") > 100

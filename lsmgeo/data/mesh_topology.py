@@ -1,0 +1,183 @@
+"""How the faces of a mesh hang together: vertices that coincide, edges, parts, closed or not."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+__all__ = [
+    "Edges",
+    "Parts",
+    "are_real",
+    "components",
+    "distinct_faces",
+    "edges_of",
+    "is_watertight",
+    "merged_faces",
+    "parts_of",
+]
+
+# An open part counts as oriented while at most this fraction of its inner edges is not.
+MISORIENTED = 0.05
+
+
+class Edges(NamedTuple):
+    """The sides of all faces, sorted so that sides on the same edge stand together.
+
+    Attributes:
+        face: (3F,) the face of each side.
+        corner: (3F,) at which corner of the face the side begins, 0, 1 or 2.
+        forward: (3F,) bool, whether the side runs from the lower to the higher vertex number.
+        edge: (3F,) number of the edge, ascending.
+    """
+
+    face: np.ndarray
+    corner: np.ndarray
+    forward: np.ndarray
+    edge: np.ndarray
+
+
+class Parts(NamedTuple):
+    """Faces connected through edges.
+
+    Attributes:
+        part: (F,) the part of each face.
+        closed: (parts,) bool, every edge belongs to an even number of the part's faces.
+        oriented: (parts,) bool, nearly all edges of two faces are run along once each way, all of them if closed.
+        doubled: (parts,) bool, most faces have another on the same three vertices.
+    """
+
+    part: np.ndarray
+    closed: np.ndarray
+    oriented: np.ndarray
+    doubled: np.ndarray
+
+
+def merged_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Faces (F, 3) by vertices merged where they coincide exactly; textures and hard edges split them in files."""
+    order, new = _grouped(vertices)
+    number = np.empty(len(vertices), np.int64)
+    number[order] = np.cumsum(new) - 1
+    return number[faces]
+
+
+def are_real(faces: np.ndarray) -> np.ndarray:
+    """(F,) bool, whether the three vertices of a face differ."""
+    return (faces != np.roll(faces, 1, axis=1)).all(1)
+
+
+def distinct_faces(faces: np.ndarray) -> np.ndarray:
+    """Which faces to keep, (K,) ascending: one of each set of three vertices."""
+    order, new = _grouped(np.sort(faces, axis=1))
+    return np.sort(order[new])
+
+
+def _grouped(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """An order (stable) that brings equal rows together, and where in it a new row begins."""
+    order = np.lexsort(rows.T[::-1])
+    ordered = rows[order]
+    new = np.ones(len(order), bool)
+    new[1:] = (ordered[1:] != ordered[:-1]).any(1)
+    return order, new
+
+
+def edges_of(faces: np.ndarray) -> Edges:
+    """The sides of all faces, those on one edge together."""
+    start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
+    order, new = _grouped(np.stack((np.minimum(start, end), np.maximum(start, end)), 1))
+    return Edges(order // 3, order % 3, (start < end)[order], np.cumsum(new) - 1)
+
+
+def is_watertight(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    """Whether every edge belongs to exactly two faces, coinciding vertices taken as one, faces of no area left out."""
+    merged = merged_faces(vertices, faces)
+    merged = merged[are_real(merged)]
+    return len(merged) > 0 and bool((np.bincount(edges_of(merged).edge) == 2).all())
+
+
+def components(count: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Which group each of ``count`` things belongs to, first[i] and second[i] being in one; (count,) int64 from 0."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_array((np.ones(len(first), np.int8), (first, second)), shape=(count, count))
+    return connected_components(links, directed=False)[1].astype(np.int64)
+
+
+def parts_of(faces: np.ndarray) -> Parts:
+    """Split faces that pass `are_real`, by merged vertices, into parts connected through edges."""
+    edges = edges_of(faces)
+    same = np.flatnonzero(edges.edge[1:] == edges.edge[:-1])
+    part = components(len(faces), edges.face[same], edges.face[same + 1])
+    count = int(part.max()) + 1
+    edge_part = np.empty(edges.edge[-1] + 1, np.int64)
+    edge_part[edges.edge] = part[edges.face]
+
+    def total(of_edge: np.ndarray) -> np.ndarray:
+        return np.bincount(edge_part, weights=of_edge, minlength=count)
+
+    valence = np.bincount(edges.edge)
+    balance = np.bincount(edges.edge, weights=np.where(edges.forward, 1.0, -1.0))
+    closed = total(valence % 2 != 0) == 0
+    wrong = total((valence == 2) & (balance != 0))
+    oriented = np.where(closed, total(balance != 0) == 0, wrong <= MISORIENTED * total(valence == 2))
+    order, new = _grouped(np.sort(faces, axis=1))
+    group = np.cumsum(new) - 1
+    copies = np.empty(len(faces), np.int64)
+    copies[order] = np.bincount(group)[group]
+    doubled = 2 * np.bincount(part, weights=copies > 1, minlength=count) > np.bincount(part, minlength=count)
+    return Parts(part, closed, oriented, doubled)
+
+
+def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F, 3) unit normals; 0 for faces of no area."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    length = np.linalg.norm(cross, axis=1, keepdims=True)
+    return np.divide(cross, length, out=np.zeros_like(cross), where=length > 0)
+
+
+def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease: float) -> np.ndarray:
+    """Unit normals at the corners of faces, smooth but across sharp edges.
+
+    Around a vertex, the faces that follow each other over edges bent by less than ``crease`` share the mean of their
+    normals, each weighted by its angle at the vertex (Thuermer and Wuethrich, 1998).
+
+    Args:
+        vertices: (N, 3).
+        faces: (F, 3).
+        crease: degrees, 0 to 180.
+
+    Returns:
+        (F, 3, 3) float64: face, corner, x y z.
+    """
+    normals = face_normals(vertices, faces)
+    edges = edges_of(merged_faces(vertices, faces))
+    begin, end = 3 * edges.face + edges.corner, 3 * edges.face + (edges.corner + 1) % 3
+    least = np.cos(np.radians(crease))
+    links: list[tuple[np.ndarray, np.ndarray]] = []
+    # An edge of a sheet drawn from both sides has four faces; three steps reach each from each.
+    for step in range(1, 4):
+        first = np.flatnonzero(edges.edge[step:] == edges.edge[:-step])
+        second = first + step
+        bent = (normals[edges.face[first]] * normals[edges.face[second]]).sum(1) <= least
+        first, second = first[~bent], second[~bent]
+        alike = edges.forward[first] == edges.forward[second]
+        links.append((begin[first], np.where(alike, begin[second], end[second])))
+        links.append((end[first], np.where(alike, end[second], begin[second])))
+    pairs = [np.concatenate(side) for side in zip(*links, strict=True)]
+    group = components(faces.size, pairs[0], pairs[1])
+    weighted = _corner_angles(vertices, faces)[..., None] * normals[:, None]  # (F, 3, 3)
+    sums = np.stack([np.bincount(group, weights=weighted[..., axis].reshape(-1)) for axis in range(3)], 1)
+    length = np.linalg.norm(sums, axis=1)
+    smooth = sums[group].reshape(-1, 3, 3) / np.maximum(length, 1e-300)[group].reshape(-1, 3, 1)
+    return np.where((length > 1e-12)[group].reshape(-1, 3, 1), smooth, normals[:, None])
+
+
+def _corner_angles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F, 3) radians."""
+    corners = vertices[faces]
+    forth = np.roll(corners, -1, axis=1) - corners
+    back = np.roll(corners, 1, axis=1) - corners
+    return np.arctan2(np.linalg.norm(np.cross(forth, back), axis=2), (forth * back).sum(2))

@@ -1,0 +1,220 @@
+"""Where the lines of a lattice cross triangles: the exact part of turning meshes into voxels.
+
+Lattice coordinates put voxel centres at whole numbers, x, y, z in [0, n). A line runs through centres in one of 13
+directions; shearing the other two coordinates makes it parallel to an axis, and centres stay on whole numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+__all__ = [
+    "LINES",
+    "Crossings",
+    "Line",
+    "cells_touched",
+    "crossing_counts",
+    "crossings",
+    "first_and_last",
+    "line_extent",
+]
+
+# Largest number of (triangle, row) or (triangle, column) pairs held at once.
+CHUNK = 1 << 21
+
+Shape = tuple[int, int, int]
+
+
+class Line(NamedTuple):
+    """A family of parallel lines through the voxel centres.
+
+    Attributes:
+        axis: the coordinate (0 x, 1 y, 2 z) that advances by one from centre to centre.
+        slopes: what the two other coordinates, in ascending order, gain at each step: -1, 0 or 1.
+    """
+
+    axis: int
+    slopes: tuple[int, int]
+
+    @property
+    def others(self) -> tuple[int, int]:
+        """The two coordinates that tell the lines of the family apart, before the shear."""
+        first, second = (axis for axis in range(3) if axis != self.axis)
+        return first, second
+
+
+# The three axes, the six diagonals of the faces and the four of the cube: each once, both ways along it.
+LINES = (
+    Line(0, (0, 0)), Line(1, (0, 0)), Line(2, (0, 0)),
+    Line(0, (1, 0)), Line(0, (-1, 0)), Line(0, (0, 1)), Line(0, (0, -1)), Line(1, (0, 1)), Line(1, (0, -1)),
+    Line(0, (1, 1)), Line(0, (1, -1)), Line(0, (-1, 1)), Line(0, (-1, -1)),
+)  # fmt: skip
+
+
+class Crossings(NamedTuple):
+    """Where lines cross triangles, in no particular order.
+
+    Attributes:
+        column: (K,) which line, its first coordinate after the shear.
+        row: (K,) which line, its second coordinate after the shear.
+        place: (K,) float64 where along the line.
+        sign: (K,) int8, +1 or -1, which side of the triangle the line meets; 0 on a triangle seen edge-on.
+    """
+
+    column: np.ndarray
+    row: np.ndarray
+    place: np.ndarray
+    sign: np.ndarray
+
+
+def sheared(points: np.ndarray, line: Line) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Coordinates in which the lines are parallel to an axis: (column coordinate, row coordinate, along)."""
+    along = points[..., line.axis]
+    first, second = (points[..., axis] - slope * along for axis, slope in zip(line.others, line.slopes, strict=True))
+    return first, second, along
+
+
+def line_extent(shape: Shape, line: Line, index: int) -> tuple[int, int]:
+    """The half-open range of a sheared coordinate in which lines pass through centres."""
+    slope, size, length = line.slopes[index], shape[line.others[index]], shape[line.axis]
+    return min(0, -slope * (length - 1)), size + max(0, -slope * (length - 1))
+
+
+def crossings(triangles: np.ndarray, shape: Shape, line: Line) -> Iterator[Crossings]:
+    """Cross every line of a family with every triangle.
+
+    A line meets a triangle when, seen along the line, an odd number of its edges pass to the right of it. An edge
+    is judged from its end points in a fixed order, so the two triangles beside an edge never both claim a line and
+    never both miss it: a line crosses a closed mesh an even number of times, through vertices and along edges too.
+
+    Args:
+        triangles: (F, 3, 3) float64 corners in lattice coordinates, x, y, z.
+        shape: number of voxels in x, y, z.
+        line: which family.
+
+    Yields:
+        Crossings of some triangles at a time, all of them in the end; memory is bounded by `CHUNK`.
+    """
+    u, v, along = sheared(triangles, line)  # (F, 3) each
+    (column_low, column_high), (row_low, row_high) = (line_extent(shape, line, index) for index in (0, 1))
+    bottom = np.maximum(np.ceil(v.min(1)), row_low)
+    top = np.minimum(np.ceil(v.max(1)), row_high)  # half-open: a row at the highest vertex is not crossed
+    rows = np.maximum(top - bottom, 0).astype(np.int64)
+    rows[(u.max(1) < column_low) | (u.min(1) > column_high)] = 0
+    normal = (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (v[:, 1] - v[:, 0]) * (u[:, 2] - u[:, 0])
+    for begin, end in _chunks(rows):
+        face, step = _expand(rows[begin:end])
+        face += begin
+        row = bottom[face] + step
+        left, right = _interval(u[face], v[face], row)
+        first = np.maximum(np.ceil(left), column_low)
+        count = np.maximum(np.minimum(np.ceil(right), column_high) - first, 0).astype(np.int64)
+        for start, stop in _chunks(count):
+            pair, offset = _expand(count[start:stop])
+            pair += start
+            column = first[pair] + offset
+            f, r = face[pair], row[pair]
+            place = _place(u[f], v[f], along[f], normal[f], column, r)
+            sign = np.sign(normal[f]).astype(np.int8)
+            yield Crossings(column.astype(np.int64), r.astype(np.int64), place, sign)
+
+
+def crossing_counts(triangles: np.ndarray, shape: Shape, line: Line, *, signed: bool) -> np.ndarray:
+    """How many crossings each line has in front of each centre and behind the one before, signed or not.
+
+    Returns:
+        (length + 1, columns, rows) int32; the last entry counts those behind every centre. A crossing exactly in a
+        centre counts as behind it.
+    """
+    (column_low, columns), (row_low, rows), length = _size(shape, line)
+    counts = np.zeros((length + 1) * columns * rows, np.int32)
+    for found in crossings(triangles, shape, line):
+        step = np.clip(np.floor(found.place) + 1, 0, length).astype(np.int64)
+        index = (step * columns + (found.column - column_low)) * rows + (found.row - row_low)
+        np.add.at(counts, index, found.sign.astype(np.int32) if signed else np.int32(1))
+    return counts.reshape(length + 1, columns, rows)
+
+
+def first_and_last(triangles: np.ndarray, shape: Shape, line: Line) -> tuple[np.ndarray, np.ndarray]:
+    """Where each line first and last crosses a triangle, (columns, rows) each; (inf, -inf) where it never does."""
+    (column_low, columns), (row_low, rows), _ = _size(shape, line)
+    first, last = np.full(columns * rows, np.inf), np.full(columns * rows, -np.inf)
+    for found in crossings(triangles, shape, line):
+        index = (found.column - column_low) * rows + (found.row - row_low)
+        np.minimum.at(first, index, found.place)
+        np.maximum.at(last, index, found.place)
+    return first.reshape(columns, rows), last.reshape(columns, rows)
+
+
+def cells_touched(triangles: np.ndarray, shape: Shape, finer: int = 4) -> np.ndarray:
+    """Which voxels a surface passes through, (W, H, D) bool, seen along the axes of a ``finer`` lattice."""
+    touched = np.zeros(shape, bool)
+    fine = (triangles + 0.5) * finer - 0.5
+    fine_shape = (shape[0] * finer, shape[1] * finer, shape[2] * finer)
+    for line in LINES[:3]:
+        first, second = line.others
+        cells = np.moveaxis(touched, (first, second, line.axis), (0, 1, 2))
+        for found in crossings(fine, fine_shape, line):
+            step = np.floor(found.place + 0.5)
+            within = (step >= 0) & (step < fine_shape[line.axis])
+            step = step[within].astype(np.int64)
+            cells[found.column[within] // finer, found.row[within] // finer, step // finer] = True
+    return touched
+
+
+def _size(shape: Shape, line: Line) -> tuple[tuple[int, int], tuple[int, int], int]:
+    """(lowest column, columns), (lowest row, rows) and centres along a line."""
+    extents = [line_extent(shape, line, index) for index in (0, 1)]
+    (column_low, column_high), (row_low, row_high) = extents
+    return (column_low, column_high - column_low), (row_low, row_high - row_low), shape[line.axis]
+
+
+def _interval(u: np.ndarray, v: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Between which u a row runs inside a triangle; (inf, -inf) where it does not."""
+    left, right = np.full(len(row), np.inf), np.full(len(row), -np.inf)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        # From the lower end to the upper one, and by u where level: the same numbers for both triangles at an edge.
+        swap = (v[:, i] > v[:, j]) | ((v[:, i] == v[:, j]) & (u[:, i] > u[:, j]))
+        ua, ub = np.where(swap, u[:, j], u[:, i]), np.where(swap, u[:, i], u[:, j])
+        va, vb = np.where(swap, v[:, j], v[:, i]), np.where(swap, v[:, i], v[:, j])
+        crossed = (va <= row) & (row < vb)
+        slope = (ub - ua) / np.where(crossed, vb - va, 1.0)
+        at = np.clip(ua + (row - va) * slope, np.minimum(ua, ub), np.maximum(ua, ub))
+        left = np.where(crossed & (at < left), at, left)
+        right = np.where(crossed & (at > right), at, right)
+    return left, right
+
+
+def _place(
+    u: np.ndarray, v: np.ndarray, along: np.ndarray, normal: np.ndarray, column: np.ndarray, row: np.ndarray
+) -> np.ndarray:
+    """Where a line meets the plane of a triangle; within the triangle's own range, which rounding could leave."""
+    du, dv = column - u[:, 0], row - v[:, 0]
+    second = du * (v[:, 2] - v[:, 0]) - dv * (u[:, 2] - u[:, 0])
+    third = dv * (u[:, 1] - u[:, 0]) - du * (v[:, 1] - v[:, 0])
+    safe = np.where(normal == 0, 1.0, normal)
+    rise = (second * (along[:, 1] - along[:, 0]) + third * (along[:, 2] - along[:, 0])) / safe
+    return np.clip(along[:, 0] + rise, along.min(1), along.max(1))
+
+
+def _chunks(counts: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Ranges of items whose counts add up to about `CHUNK`, one item at least."""
+    total = np.concatenate(([0], np.cumsum(counts)))
+    bounds = [0]
+    while bounds[-1] < len(counts):
+        following = int(np.searchsorted(total, total[bounds[-1]] + CHUNK, side="right")) - 1
+        bounds.append(max(following, bounds[-1] + 1))
+    for begin, end in pairwise(bounds):
+        if total[end] > total[begin]:
+            yield begin, end
+
+
+def _expand(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each index as often as its count, and which repetition it is."""
+    index = np.repeat(np.arange(len(counts)), counts)
+    first = np.cumsum(counts) - counts
+    return index, np.arange(len(index)) - first[index]

@@ -61,11 +61,15 @@ def test_views_rendered_together_are_views_rendered_alone(several, shadows):
     batch = CameraTensors(*(torch.cat([torch.as_tensor(one.cameras[i]) for one in several]) for i in range(2)), 15, 20)
     solids = [one.scene for one in several]
     options = {"shadows": shadows, "dtype": torch.float64}
-    alone = scenes.render(solids, batch, SUN, **options)
+    strengths = torch.linspace(0.2, 0.6, len(several)).view(-1, 1, 1)  # each scene has lights of its own
+    lights = scenes.Lights(
+        SUN.directions.expand(len(several), 1, 3), strengths.expand(-1, 1, 3), strengths[:, 0] * SUN.ambient
+    )
+    alone = scenes.render(solids, batch, lights, **options)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rendering, "ONE_VIEW_AT_A_TIME", ())
         patch.setattr(rendering, "VIEWS_AT_ONCE", 4)
-        together = scenes.render(solids, batch, SUN, **options)
+        together = scenes.render(solids, batch, lights, **options)
     for name, expected in alone._asdict().items():
         torch.testing.assert_close(getattr(together, name), expected, rtol=1e-9, atol=1e-9, msg=name)
 

@@ -5,6 +5,7 @@ Both come from outside. Nothing is believed of them that the tar's size or anoth
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import tarfile
@@ -22,7 +23,17 @@ from lsmgeo.data.members import KEY, SUFFIX
 from lsmgeo.data.metadata import decode_metadata, is_text
 from lsmgeo.errors import DataError
 
-__all__ = ["BLOCK", "MAX_SHAPES", "Member", "ShardIndex", "index_tar", "open_index", "read_sidecar", "sidecar_path"]
+__all__ = [
+    "BLOCK",
+    "MAX_SHAPES",
+    "Member",
+    "ShardIndex",
+    "index_tar",
+    "open_index",
+    "read_sidecar",
+    "seal",
+    "sidecar_path",
+]
 
 BLOCK = 512
 MAX_SHAPES = 10_000
@@ -30,6 +41,7 @@ MAX_MEMBERS = 1_000_000  # in a shard
 MAX_MEMBER_BYTES = 1 << 26
 MAX_SIDECAR_BYTES = 1 << 24
 MAX_EXTENSION_BYTES = 1 << 16
+SEAL = b'{"index_sha256":"'
 
 
 class Member(NamedTuple):
@@ -129,6 +141,11 @@ def _size_of(path: Path) -> int:
         raise DataError(path, f"cannot be read ({error})") from error
 
 
+def seal(index: bytes) -> bytes:
+    """A JSON object with the SHA-256 of the rest of its text as its first value."""
+    return SEAL + hashlib.sha256(index[1:]).hexdigest().encode() + b'",' + index[1:]
+
+
 def read_sidecar(path: Path) -> ShardIndex:
     """Read and check the sidecar of a shard.
 
@@ -141,8 +158,13 @@ def read_sidecar(path: Path) -> ShardIndex:
     size = _size_of(path)
     sidecar = sidecar_path(path)
     content = read_bytes(sidecar, MAX_SIDECAR_BYTES)
+    if not content.startswith(SEAL):
+        raise DataError(sidecar, "is not the index of a shard")
+    body = content[len(SEAL) + 66 :]
+    if seal(b"{" + body) != content:
+        raise DataError(sidecar, "is damaged (a wrong check sum)")
     try:
-        values = json.loads(content.decode("utf-8"))
+        values = json.loads(b"{" + body)
     except (ValueError, RecursionError) as error:
         raise DataError(sidecar, f"is not JSON ({error})") from error
     try:

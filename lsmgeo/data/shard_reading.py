@@ -113,9 +113,10 @@ class ShardSet:
         shard = self._shards[number]
         content = self._fetch(number, shard.member(row, "json"))
         metadata = decode_metadata(content, shard.keys[row], shard.path)
-        if metadata.name != shard.names[row]:
-            reason = f"{shard.keys[row]}.json: names {metadata.name[:80]!r}, the index {shard.names[row][:80]!r}"
-            raise DataError(shard.path, reason)
+        for field, indexed in (("name", shard.names), ("category", shard.categories), ("split", shard.splits)):
+            if getattr(metadata, field) != indexed[row]:
+                reason = f"{field} is {getattr(metadata, field)!r:.80}, in the index {indexed[row]!r:.80}"
+                raise DataError(shard.path, f"{shard.keys[row]}.json: {reason}")
         if len(metadata.intrinsics) != self.view_counts[index]:
             reason = f"tells of {len(metadata.intrinsics)} views, the shard holds {self.view_counts[index]}"
             raise DataError(shard.path, f"{shard.keys[row]}.json: {reason}")

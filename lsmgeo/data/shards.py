@@ -20,7 +20,7 @@ from lsmgeo._checks import describe
 from lsmgeo.data.files import atomic_file
 from lsmgeo.data.members import SUFFIX, format_key
 from lsmgeo.data.metadata import decode_metadata
-from lsmgeo.data.shard_index import BLOCK, MAX_SHAPES, read_sidecar, sidecar_path
+from lsmgeo.data.shard_index import BLOCK, MAX_SHAPES, read_sidecar, seal, sidecar_path
 from lsmgeo.errors import DataError, OptionError
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def write_shard(
     }
     with atomic_file(sidecar) as stream:
         _lock(stream)
-        stream.write(json.dumps(index, separators=(",", ":")).encode() + b"\n")
+        stream.write(seal(json.dumps(index, separators=(",", ":")).encode() + b"\n"))
     return path
 
 

@@ -1,5 +1,6 @@
 """Shards, sidecars and pictures that lie: a DataError that names the file, little memory, nothing written anywhere."""
 
+import hashlib
 import io
 import json
 import os
@@ -28,6 +29,14 @@ def read_all(folder):
     return samples
 
 
+def sealed(text):
+    """The text of a sidecar without its check sum, or with one of that length: with one that fits."""
+    start = '{"index_sha256":"'
+    rest = text[len(start) + 66 :] if text.startswith(start) else text[1:]
+    digest = hashlib.sha256(rest.encode("latin-1")).hexdigest()
+    return f'{start}{digest}",{rest}'.encode("latin-1")
+
+
 def refused(folder, match, file):
     with pytest.raises(DataError, match=match) as caught:
         read_all(folder)
@@ -43,7 +52,9 @@ def folder(tmp_path):
 
 @pytest.fixture
 def index(folder):
-    return json.loads((folder / SIDECAR).read_text())
+    values = json.loads((folder / SIDECAR).read_text())
+    del values["index_sha256"]
+    return values
 
 
 def entry(index, **fields):
@@ -67,7 +78,9 @@ SIDECARS = {
     "a key twice": (lambda i: entry(i, key="00000001"), "uses a key twice"),
     "a name twice": (lambda i: entry(i, name="shape-1"), "uses a name twice"),
     "a long name": (lambda i: entry(i, name="x" * 2000), "name of 00000000 must be"),
-    "another name": (lambda i: entry(i, name="other"), None),
+    "another name": (lambda i: entry(i, name="other"), "name is 'shape-0', in the index 'other'"),
+    "another category": (lambda i: entry(i, category="lamp"), "category is 'chair', in the index 'lamp'"),
+    "another split": (lambda i: entry(i, split=None), "split is 'train', in the index None"),
     "a category of any kind": (lambda i: entry(i, category=["chair"]), "category of 00000000 must be"),
     "no such layout": (lambda i: entry(i, layout=1), "layout of 00000000 must be"),
     "a negative layout": (lambda i: entry(i, layout=-1), "layout of 00000000 must be"),
@@ -90,21 +103,27 @@ SIDECARS = {
 def test_sidecars_are_checked(folder, index, name):
     change, match = SIDECARS[name]
     change(index)
-    (folder / SIDECAR).write_text(json.dumps(index))
-    if match is None:
-        refused(folder, "names 'shape-0', the index 'other'", TAR)
-    else:
-        refused(folder, match, SIDECAR)
+    (folder / SIDECAR).write_bytes(sealed(json.dumps(index)))
+    refused(folder, match, TAR if "in the index" in match else SIDECAR)
 
 
 @pytest.mark.parametrize(
     ("content", "match"),
-    [(b"", "not JSON"), (b"\xff\xfe", "not JSON"), (b"[" * 100_000, "not JSON"), (b"[]", "not the index"),
-     (b'{"version":' + b"9" * 100_000 + b"}", "not JSON"), (bytes((1 << 24) + 1), "larger than the limit"),
-     (b"null", "not the index")],
+    [(b"", "not the index"), (b"null", "not the index"), (b'{"format":"lsmgeo shard index"}', "not the index"),
+     (b"[" * 100_000, "not the index"), (bytes((1 << 24) + 1), "larger than the limit")],
 )  # fmt: skip
 def test_sidecars_of_other_content(folder, content, match):
     (folder / SIDECAR).write_bytes(content)
+    refused(folder, match, SIDECAR)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [("{", "not JSON"), ('{"a":\xff}', "not JSON"), ('{"a":' + "[" * 100_000, "not JSON"),
+     ('{"a":1}', "lacks 'format'"), ('{"version":' + "9" * 100_000 + "}", "not JSON"), ('{"format":1}', "not the index of a shard")],
+)  # fmt: skip
+def test_sidecars_of_other_content_with_a_fitting_check_sum(folder, text, match):
+    (folder / SIDECAR).write_bytes(sealed(text))
     refused(folder, match, SIDECAR)
 
 
@@ -113,7 +132,7 @@ def test_a_sidecar_of_other_places_is_noticed(folder, index):
     offsets[1], offsets[2] = offsets[2], offsets[1]
     sizes = index["entries"][0]["sizes"]
     sizes[1] = sizes[2] = min(sizes[1:3])
-    (folder / SIDECAR).write_text(json.dumps(index))
+    (folder / SIDECAR).write_bytes(sealed(json.dumps(index)))
     refused(folder, "is not where the index says", TAR)
 
 
@@ -396,7 +415,8 @@ def test_mutated_shards_are_refused_or_read(tmp_path, what):
     def judge(number):
         rng = np.random.default_rng([number, len(what)])
         if what == "sidecar":
-            sidecar.write_bytes(mutated(rng, index))
+            text = mutated(rng, index)
+            sidecar.write_bytes(text if number % 4 == 0 else sealed(text.decode("latin-1")))
         elif what == "tar":
             tar.write_bytes(mutated(rng, content))
         else:
@@ -408,7 +428,7 @@ def test_mutated_shards_are_refused_or_read(tmp_path, what):
             if what == "fitting sidecar":
                 fitting = json.loads(index)
                 fitting["entries"][0]["crc32"][0] = zlib.crc32(text)
-                sidecar.write_text(json.dumps(fitting))
+                sidecar.write_bytes(sealed(json.dumps(fitting)))
         return judged(lambda: read_all(folder))
 
     came = forked.outcomes(range(400), judge)

@@ -16,6 +16,7 @@ import torch
 import webdataset
 from PIL import Image
 
+from lsmgeo import scenes
 from lsmgeo.data import ShardSet, encode_sample, files, hash_settings, shard_reading, verify_shard, write_shard
 from lsmgeo.data.png import DEPTH, RGBA, decode_png, encode_png
 from lsmgeo.errors import CameraError, DataError, DTypeError, OptionError, ShapeError
@@ -235,11 +236,18 @@ def test_verifying(tmp_path):
         with pytest.raises(DataError, match=r"set-000000.json: tells of"):
             ShardSet(tmp_path)
     path.write_bytes(content)
-    for length in (0, 1, len(index) // 2, len(index) - 2):
-        sidecar.write_bytes(index[:length])
+    damaged = [index[:length] for length in (0, 1, len(index) // 2, len(index) - 1)]
+    for position in rng.integers(len(index), size=60):
+        flipped = bytearray(index)
+        flipped[position] ^= 1 << int(rng.integers(8))
+        damaged.append(bytes(flipped))
+    for wrong in damaged:
+        sidecar.write_bytes(wrong)
         assert verify_shard(path, SETTINGS) is False
-        with pytest.raises(DataError, match=r"set-000000.json: is not JSON"):
+        with pytest.raises(DataError, match=r"set-000000.json: is (damaged|not the index)"):
             ShardSet(tmp_path)
+    sidecar.write_bytes(index)
+    assert verify_shard(path, SETTINGS) is True
     sidecar.unlink()
     assert verify_shard(path, SETTINGS) is False
 
@@ -418,6 +426,23 @@ def test_backgrounds_from_a_folder(tmp_path):
         read(0)
     with pytest.raises(DataError, match="is no folder of backgrounds"):
         shards.read(0, background="whlte", occupancy=8)
+
+
+def test_drawn_backgrounds(tmp_path, monkeypatch):
+    """One for each view, drawn with the generator that was given."""
+    shapes = write_set(tmp_path, shards=1)
+
+    def background(generator, height, width):
+        return torch.full((3, height, width), generator.random())
+
+    monkeypatch.setattr(scenes, "background", background, raising=False)
+    sample = ShardSet(tmp_path).read(
+        2, views=[1, 0], occupancy=8, background="random", generator=np.random.default_rng(4)
+    )
+    drawn = np.random.default_rng(4).random(2)
+    colours, mask = shapes[2].pixels[[1, 0]] / np.float32(255), shapes[2].mask[[1, 0]][..., None]
+    expected = np.where(mask, colours, drawn[:, None, None, None])
+    np.testing.assert_array_equal(sample.images.permute(0, 2, 3, 1).numpy(), expected.astype(np.float32))
 
 
 def test_names_are_unique_in_a_set(tmp_path):

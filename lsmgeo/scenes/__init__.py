@@ -1,7 +1,9 @@
 """Analytic scenes: exact ray hits, depth, normals, silhouettes and occupancy of solids and their unions."""
 
+from lsmgeo.scenes.backgrounds import background
 from lsmgeo.scenes.inside import occupancy, voxels
 from lsmgeo.scenes.lighting import Lights, shade
+from lsmgeo.scenes.meshing import to_mesh
 from lsmgeo.scenes.rendering import Hits, Rendering, render, trace
 from lsmgeo.scenes.solids import Kind, Material, Solid, box, cone, cylinder, ellipsoid, half_space, sphere
 from lsmgeo.scenes.tables import Scene
@@ -14,6 +16,7 @@ __all__ = [
     "Rendering",
     "Scene",
     "Solid",
+    "background",
     "box",
     "cone",
     "cylinder",
@@ -23,6 +26,7 @@ __all__ = [
     "render",
     "shade",
     "sphere",
+    "to_mesh",
     "trace",
     "voxels",
 ]

@@ -37,7 +37,7 @@ def to_mesh(scene: Scene, *, segments: int = 64) -> trimesh.Trimesh:
         >>> from lsmgeo.scenes.meshing import to_mesh
         >>> wedge = box((0, 0, 0), (1, 1, 1)).minus(half_space((0, 0, 0), (1, 1, 0)))
         >>> mesh = to_mesh(Scene([wedge]))
-        >>> mesh.is_watertight, mesh.volume
+        >>> mesh.is_watertight, float(mesh.volume)
         (True, 0.500)
     """
     import manifold3d

@@ -1,0 +1,153 @@
+"""Parts that several categories share. Lengths are in the category's own unit; the front is +x, up is +y."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from lsmgeo.scenes.solids import Kind, Material, Solid, box, cone, cylinder, half_space
+
+__all__ = [
+    "bar",
+    "below",
+    "block",
+    "kept",
+    "pair",
+    "rack",
+    "ring",
+    "spaced",
+    "spokes",
+    "tube",
+    "wheel",
+    "window",
+    "wing",
+]
+
+Vector = Sequence[float] | np.ndarray
+
+
+def block(low: Vector, high: Vector, material: Material) -> Solid:
+    """The box between two opposite corners."""
+    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    return box((low + high) / 2, high - low, material)
+
+
+def bar(start: Vector, end: Vector, width: float, depth: float, material: Material) -> Solid:
+    """A sheared box that leads from one point to another one at another height: its ends lie flat.
+
+    ``width`` is measured along x, ``depth`` along z.
+    """
+    start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    matrix = np.stack(((width / 2, 0, 0), (end - start) / 2, (0, 0, depth / 2), (start + end) / 2), 1)
+    return Solid(Kind.BOX, matrix, material=material)
+
+
+def wing(root: Vector, tip: Vector, root_chord: float, tip_chord: float, thickness: float, material: Material) -> Solid:
+    """A wing or fin of one thickness whose chord runs along x, between the middles of its two chords.
+
+    The thickness is measured along y, or along z where the wing stands upright.
+    """
+    root, tip = np.asarray(root, dtype=np.float64), np.asarray(tip, dtype=np.float64)
+    upright = abs(tip[1] - root[1]) > abs(tip[2] - root[2])
+    thin = np.array([0.0, 0.0, 1.0] if upright else [0.0, 1.0, 0.0])
+    # A sheared box along the trailing edge, of which the leading edge is cut off: so a box around it stays small.
+    reach, chord = np.array([root_chord / 2, 0, 0]), np.array([tip_chord / 2, 0, 0])
+    middles = (root, tip - chord + reach)
+    matrix = np.stack((reach, (middles[1] - root) / 2, thickness / 2 * thin, (root + middles[1]) / 2), 1)
+    slab = Solid(Kind.BOX, matrix, material=material)
+    edge = tip + chord - root - reach
+    normal = np.cross(edge, thin)
+    return kept(slab, root + reach, -np.sign(normal[0]) * normal)
+
+
+def kept(solid: Solid, point: Vector, towards: Vector) -> Solid:
+    """What lies on the side of the plane through ``point`` to which ``towards`` points."""
+    return solid.minus(half_space(point, towards))
+
+
+def below(solid: Solid, first: tuple[float, float], second: tuple[float, float], *, axis: int = 2) -> Solid:
+    """What lies below the plane that holds coordinate ``axis`` and two points (x, y), or (z, y) for axis 0."""
+    along, up = second[0] - first[0], second[1] - first[1]
+    down = (up, -along) if along > 0 else (-up, along)
+    if axis == 2:
+        return kept(solid, (first[0], first[1], 0.0), (down[0], down[1], 0.0))
+    return kept(solid, (0.0, first[1], first[0]), (0.0, down[1], down[0]))
+
+
+def pair(*solids: Solid) -> list[Solid]:
+    """Parts, and the same parts mirrored to the other side, in the plane z = 0."""
+    return [*solids, *(solid.mirrored(2) for solid in solids)]
+
+
+def spaced(low: float, high: float, count: int) -> list[float]:
+    """The middles of ``count`` equal pieces of an interval."""
+    return [low + (index + 0.5) * (high - low) / count for index in range(count)]
+
+
+def rack(
+    low: Vector, high: Vector, axis: int, count: int, material: Material, filling: float | None = None
+) -> list[Solid]:
+    """Slats: a box cut into ``count`` bars along ``axis``, of which each fills ``filling`` of its share."""
+    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    share = (high[axis] - low[axis]) / count
+    slats = []
+    for middle in spaced(low[axis], high[axis], count):
+        size, center = high - low, (low + high) / 2
+        size[axis], center[axis] = share * (0.5 if filling is None else filling), middle
+        slats.append(box(center, size, material))
+    return slats
+
+
+def window(low: Vector, high: Vector, axis: int, width: float, material: Material) -> list[Solid]:
+    """A rectangular frame of four bars ``width`` wide around a hole along ``axis``."""
+    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    bars = []
+    for across in (index for index in range(3) if index != axis):
+        for end in (0, 1):
+            first, second = low.copy(), high.copy()
+            if end:
+                first[across] = high[across] - width
+            else:
+                second[across] = low[across] + width
+            bars.append(block(first, second, material))
+    return bars
+
+
+def spokes(
+    hub: Vector, radius: float, drop: float, count: int, width: float, material: Material, *, turn: float = 0.0
+) -> list[Solid]:
+    """Rods that leave a hub outwards in all directions and end ``drop`` lower: star feet, tripods."""
+    hub = np.asarray(hub, dtype=np.float64)
+    angles = np.deg2rad(turn) + 2 * np.pi * np.arange(count) / count
+    ends = (hub + np.array([radius * np.cos(a), -drop, radius * np.sin(a)]) for a in angles)
+    return [cylinder(hub, end, width / 2, material) for end in ends]
+
+
+def ring(points: Iterable[Vector], radius: float, material: Material) -> list[Solid]:
+    """Rods along a chain of points, each a little longer than its piece, so that bends are closed."""
+    chain = [np.asarray(point, dtype=np.float64) for point in points]
+    rods = []
+    for first, second in pairwise(chain):
+        over = (second - first) / np.linalg.norm(second - first) * radius * 0.7
+        rods.append(cylinder(first - over, second + over, radius, material))
+    return rods
+
+
+def tube(start: Vector, end: Vector, start_radius: float, end_radius: float, wall: float, material: Material) -> Solid:
+    """A frustum hollow from end to end: lamp shades, horns."""
+    start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    over = (end - start) * 1e-3  # no coincident faces between a part and what is cut out of it
+    outer = cone(start, end, start_radius, end_radius, material)
+    return outer.minus(cone(start - over, end + over, start_radius - wall, end_radius - wall))
+
+
+def wheel(center: Vector, radius: float, width: float, tyre: Material, hub: Material) -> list[Solid]:
+    """A wheel that rolls along x, with a hub cap that stands out on both sides."""
+    center = np.asarray(center, dtype=np.float64)
+    across = np.array([0.0, 0.0, width / 2])
+    return [
+        cylinder(center - across, center + across, radius, tyre),
+        cylinder(center - 1.15 * across, center + 1.15 * across, 0.55 * radius, hub),
+    ]

@@ -1,0 +1,229 @@
+"""Sofas.
+
+Structures: a plan (straight, corner left, corner right, daybed, round), arms (box, roll, slanted, wing, none), a back
+(block, cushions, roll, camel, rail), a support (plinth, legs, frame), loose cushions or none, a chaise with or
+without a back.
+"""
+
+from __future__ import annotations
+
+from lsmgeo.scenes.solids import Solid, box, cylinder, ellipsoid
+from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
+from lsmgeo.scenes.synthetic13.parts import bar, below, block, pair, spaced, window
+
+__all__ = ["build"]
+
+
+def build(p: Parameters, colours: Palette) -> list[Solid]:
+    """The parts of one sofa, in metres; one sits facing +x, its width along z."""
+    plan = p.choice("plan", ("straight", "straight", "corner left", "corner right", "daybed", "round"))
+    arms = p.choice("arms", ("box", "roll", "slanted", "wing", "none")) if plan != "round" else "none"
+    seats = p.count("seats", 1, 4) if plan == "straight" else p.count("seats", 2, 4)
+    width = seats * p.uniform("seat_width", 0.5, 0.75)
+    depth, frame = p.uniform("depth", 0.6, 1.05), p.uniform("frame_height", 0.1, 0.22)
+    cushion, arm = p.uniform("cushion", 0.1, 0.2), p.uniform("arm_width", 0.1, 0.28)
+    rise, back = p.uniform("back_height", 0.25, 0.65), p.uniform("back_thickness", 0.14, 0.3)
+    support = p.choice("support", ("plinth", "legs", "legs", "frame") if plan != "round" else ("legs", "plinth"))
+    lift = p.uniform("clearance", 0.04, 0.08) if support == "plinth" else p.uniform("clearance", 0.1, 0.24)
+    x, z = depth / 2, width / 2
+    floor = lift + frame
+    height = floor + cushion
+
+    if plan == "round":
+        parts = _round(p, support, colours, (lift, floor, height), rise, back, x, z)
+    else:
+        parts = [block((-x, lift, -z), (x, floor, z), colours.body)]
+        parts += [
+            _pad((-x + back - 0.02, floor - 0.02, low), (x + 0.02, height, high), colours)
+            for low, high in _pieces(-z, z, seats)
+        ]
+        if plan != "daybed":
+            parts += _back(p, colours, (lift, floor, height + rise), (x, z), back, seats)
+        else:
+            bolster = cylinder((-x, height + 0.1, -z + 0.12), (x, height + 0.1, -z + 0.12), 0.14, colours.trim)
+            parts += [bolster, block((-x, lift, -z - 0.06), (x, height + 0.6 * rise, -z), colours.body)]
+        parts += _arms(p, arms, plan, colours, (lift, height), (x, z), arm, back)
+    if plan.startswith("corner"):
+        parts += _chaise(p, colours, 1 if plan.endswith("right") else -1, (lift, floor, height), (x, z), width / seats)
+    if plan != "round":
+        parts += _support(p, support, colours, lift, x, z)
+    if plan == "straight" and p.choice("loose", ("none", "cushions")) == "cushions":
+        size = p.uniform("loose_size", 0.16, 0.24)
+        pillow = ellipsoid((-x + back + 0.1, height + 0.85 * size, z - 1.1 * size), (0.09, size, size), colours.detail)
+        parts += pair(pillow.rotated(2, 15, (-x + back + 0.1, height, 0)))
+    return parts
+
+
+def _pieces(low: float, high: float, count: int) -> list[tuple[float, float]]:
+    """An interval in ``count`` pieces with seams between them."""
+    step = (high - low) / count
+    return [(low + index * step + 0.012, low + (index + 1) * step - 0.012) for index in range(count)]
+
+
+def _pad(low: tuple[float, float, float], high: tuple[float, float, float], colours: Palette) -> Solid:
+    return block(low, high, colours.trim)
+
+
+def _back(
+    p: Parameters,
+    colours: Palette,
+    levels: tuple[float, float, float],
+    half: tuple[float, float],
+    thick: float,
+    seats: int,
+) -> list[Solid]:
+    """The back rest along the rear edge."""
+    form = p.choice("back", ("block", "cushions", "roll", "camel", "rail"))
+    (lift, floor, top), (x, z) = levels, half
+    lean = p.uniform("back_lean", 2, 16)
+    pivot = (-x, floor, 0)
+    wall = block((-x, lift, -z), (-x + thick, top, z), colours.body)
+    if form == "block":
+        return [wall.rotated(2, lean / 3, pivot)]
+    if form == "cushions":
+        low = block((-x, lift, -z), (-x + 0.45 * thick, top - 0.06, z), colours.body)
+        pads = [
+            block((-x + 0.3 * thick, floor + 0.05, a), (-x + 1.2 * thick, top, b), colours.trim).rotated(2, lean, pivot)
+            for a, b in _pieces(-z, z, seats)
+        ]
+        return [low, *pads]
+    if form == "roll":
+        level = top - 0.5 * thick
+        roll = cylinder((-x + 0.4 * thick, level, -z), (-x + 0.4 * thick, level, z), 0.55 * thick, colours.body)
+        return [block((-x, lift, -z), (-x + 0.8 * thick, level, z), colours.body), roll]
+    if form == "camel":
+        hump = ellipsoid((-x + 0.5 * thick, top - 0.12, 0), (0.5 * thick, 0.24, 0.75 * z), colours.body)
+        return [block((-x, lift, -z), (-x + thick, top - 0.1, z), colours.body), hump]
+    level = 0.6 * floor + 0.4 * top
+    rails = [
+        block((-x, level - 0.06, -z), (-x + 0.07, level, z), colours.detail),
+        block((-x, top - 0.09, -z), (-x + 0.07, top, z), colours.detail),
+    ]
+    posts = [
+        block((-x, lift, place - 0.04), (-x + 0.07, top, place + 0.04), colours.detail)
+        for place in (-z + 0.04, 0.0, z - 0.04)
+    ]
+    pads = [
+        block((-x + 0.05, floor + 0.05, a), (-x + 0.05 + 0.8 * thick, top - 0.08, b), colours.trim)
+        for a, b in _pieces(-z, z, seats)
+    ]
+    return [*rails, *posts, *pads]
+
+
+def _arms(
+    p: Parameters,
+    arms: str,
+    plan: str,
+    colours: Palette,
+    levels: tuple[float, float],
+    half: tuple[float, float],
+    width: float,
+    back: float,
+) -> list[Solid]:
+    """Arm rests outside the seat; on a daybed none, where a corner sofa has its chaise one."""
+    (lift, height), (x, z) = levels, half
+    if arms == "none" or plan == "daybed":
+        return []
+    rise = p.uniform("arm_height", 0.12, 0.28)
+    top = height + rise
+    front = x - p.uniform("arm_setback", 0.0, 0.12)
+    if arms == "box":
+        parts = [block((-x, lift, z - 0.01), (front, top, z + width), colours.body)]
+    elif arms == "roll":
+        radius = 0.62 * width
+        parts = [
+            block((-x, lift, z - 0.01), (front, top - 0.5 * radius, z + 0.8 * width), colours.body),
+            cylinder(
+                (-x, top - radius, z + 0.5 * width), (front + 0.02, top - radius, z + 0.5 * width), radius, colours.body
+            ),
+        ]
+    elif arms == "slanted":
+        body = block((-x, lift, z - 0.01), (front, top + 0.25, z + width), colours.body)
+        parts = [below(body, (-x, top + 0.25), (front, height + 0.02))]
+    else:
+        # Wings: the arm ends in an ear beside the back.
+        parts = [
+            block((-x, lift, z - 0.01), (front, top, z + 0.7 * width), colours.body),
+            block((-x, top - 0.05, z - 0.01), (-x + 1.8 * back, top + 0.3, z + 0.5 * width), colours.body),
+        ]
+    if plan.startswith("corner"):
+        side = -1 if plan.endswith("right") else 1
+        return parts if side > 0 else [part.mirrored(2) for part in parts]
+    return pair(*parts)
+
+
+def _chaise(
+    p: Parameters,
+    colours: Palette,
+    side: int,
+    levels: tuple[float, float, float],
+    half: tuple[float, float],
+    piece: float,
+) -> list[Solid]:
+    """The long seat at one end, towards +x, with or without a back of its own."""
+    (lift, floor, height), (x, z) = levels, half
+    reach, wide = p.uniform("chaise_length", 0.5, 1.3), 1.1 * piece
+    out = x + reach
+    parts = [
+        block((-x, lift, z - wide), (out, floor, z), colours.body),
+        block((x + 0.04, floor - 0.02, z - wide + 0.012), (out, height, z - 0.012), colours.trim),
+        block((out - 0.14, 0, z - 0.12), (out - 0.05, lift + 0.01, z - 0.04), colours.detail),
+        block((out - 0.14, 0, z - wide + 0.04), (out - 0.05, lift + 0.01, z - wide + 0.12), colours.detail),
+    ]
+    if p.choice("chaise", ("open", "backed")) == "backed":
+        rise = p.uniform("chaise_back", 0.25, 0.5)
+        parts.append(block((-x, lift, z - 0.01), (out, height + rise, z + 0.18), colours.body))
+    return [part.scaled((1, 1, side)) for part in parts]
+
+
+def _support(p: Parameters, support: str, colours: Palette, lift: float, x: float, z: float) -> list[Solid]:
+    width = p.uniform("leg_width", 0.05, 0.1)
+    if support == "plinth":
+        return [block((-x + 0.06, 0, -z + 0.06), (x - 0.06, lift + 0.01, z - 0.06), colours.detail)]
+    near, side = x - 0.12, z - 0.1
+    if support == "legs":
+        return pair(
+            *(
+                bar((s * (near + 0.03), 0, side + 0.03), (s * near, lift + 0.02, side), width, width, colours.detail)
+                for s in (-1, 1)
+            )
+        )
+    return pair(*window((-near, 0, side - width), (near, lift + 0.05, side), 2, 0.05, colours.detail)[:4])
+
+
+def _round(
+    p: Parameters,
+    support: str,
+    colours: Palette,
+    levels: tuple[float, float, float],
+    rise: float,
+    back: float,
+    x: float,
+    z: float,
+) -> list[Solid]:
+    """A sofa in the round: an oval seat in a curved back that opens to the front."""
+    lift, floor, height = levels
+    opening = p.uniform("opening", -0.2, 0.5) * x
+    inner = max(1 - 0.9 * back / min(x, z), 0.5)
+
+    def oval(low: float, high: float, share: float) -> Solid:
+        return cylinder((0, low, 0), (0, high, 0), share, colours.body).scaled((x, 1.0, z))
+
+    front = box((opening + 5, height + 5, 0), (10, 10, 10))
+    shell = oval(lift, height + rise, 1.0).minus(oval(floor, height + 2 * rise, inner), front)
+    parts = [shell, oval(lift, floor - 0.03, 1.0), oval(lift + 0.01, height, inner + 0.02).painted(colours.trim)]
+    size = p.uniform("leg_width", 0.05, 0.1)
+    if support == "plinth":
+        parts.append(oval(0, lift + 0.01, 1 - size).painted(colours.detail))
+    else:
+        legs = (
+            cylinder((s * 0.55 * x, 0, 0.55 * z), (s * 0.55 * x, lift + 0.02, 0.55 * z), size / 2, colours.detail)
+            for s in (-1, 1)
+        )
+        parts += pair(*legs)
+    reach = min(0.5 * rise, 0.3)
+    pads = (
+        ellipsoid((-inner * x + 0.16, height + reach, place), (0.1, reach, 0.28 * z), colours.detail)
+        for place in spaced(-0.5 * z, 0.5 * z, 2)
+    )
+    return [*parts, *pads]

@@ -1,4 +1,4 @@
-"""Shards, sidecars and pictures that lie: a DataError that names the file, little memory, nothing written anywhere."""
+"""Shards and sidecars that lie: a DataError that names the file, little memory, nothing written anywhere."""
 
 import hashlib
 import io
@@ -12,21 +12,12 @@ import numpy as np
 import pytest
 
 from lsmgeo.data import ShardSet
-from lsmgeo.data.png import DEPTH, RGBA, decode_png, encode_png
 from lsmgeo.errors import DataError
+from tests.data.hostile import SIDECAR, TAR, judged, mutated, read_all, refused, rewritten
 from tests.data.shapes import write_set
 from tests.fuzz import forked
 
-TAR, SIDECAR = "set-000000.tar", "set-000000.json"
 pytestmark = pytest.mark.timeout(120)
-
-
-def read_all(folder):
-    shards = ShardSet(folder)
-    samples = [shards.read(index, occupancy=8) for index in range(len(shards))]
-    for sample in samples:
-        assert all(tensor.isfinite().all() for tensor in (sample.images, sample.depth, *sample.cameras[:2]))
-    return samples
 
 
 def sealed(text):
@@ -35,13 +26,6 @@ def sealed(text):
     rest = text[len(start) + 66 :] if text.startswith(start) else text[1:]
     digest = hashlib.sha256(rest.encode("latin-1")).hexdigest()
     return f'{start}{digest}",{rest}'.encode("latin-1")
-
-
-def refused(folder, match, file):
-    with pytest.raises(DataError, match=match) as caught:
-        read_all(folder)
-    assert str(caught.value.path) == str(folder / file)
-    assert str(folder / file) in str(caught.value)
 
 
 @pytest.fixture
@@ -120,7 +104,8 @@ def test_sidecars_of_other_content(folder, content, match):
 @pytest.mark.parametrize(
     ("text", "match"),
     [("{", "not JSON"), ('{"a":\xff}', "not JSON"), ('{"a":' + "[" * 100_000, "not JSON"),
-     ('{"a":1}', "lacks 'format'"), ('{"version":' + "9" * 100_000 + "}", "not JSON"), ('{"format":1}', "not the index of a shard")],
+     ('{"a":1}', "lacks 'format'"),
+     ('{"version":' + "9" * 100_000 + "}", "not JSON"), ('{"format":1}', "not the index of a shard")],
 )  # fmt: skip
 def test_sidecars_of_other_content_with_a_fitting_check_sum(folder, text, match):
     (folder / SIDECAR).write_bytes(sealed(text))
@@ -205,19 +190,6 @@ def test_tars_are_checked(tmp_path, name):
     content, match = TARS[name]
     (tmp_path / TAR).write_bytes(content)
     refused(tmp_path, match, TAR)
-
-
-def rewritten(folder, change):
-    """The shard without its sidecar, members changed by ``change(members)``."""
-    (folder / SIDECAR).unlink()
-    with tarfile.open(folder / TAR) as tar:
-        members = {info.name: tar.extractfile(info).read() for info in tar.getmembers()}
-    change(members)
-    with tarfile.open(folder / TAR, "w", format=tarfile.USTAR_FORMAT) as tar:
-        for name, content in members.items():
-            info = tarfile.TarInfo(name)
-            info.size = len(content)
-            tar.addfile(info, io.BytesIO(content))
 
 
 def changed_json(change):
@@ -317,83 +289,6 @@ def test_arrays_are_checked(folder, content, match):
     assert not os.path.exists("pwned")
 
 
-def chunk(kind, content, crc=None):
-    crc = zlib.crc32(kind + content) if crc is None else crc
-    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc)
-
-
-def png(width=16, height=12, bits=8, colour=6, interlace=0, data=None, before=b"", after=b""):
-    data = zlib.compress(bytes(height * (1 + 4 * width))) if data is None else data
-    start = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, interlace)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", start) + before + chunk(b"IDAT", data) + after + chunk(b"IEND", b"")
-
-
-PNGS = {
-    "nothing": (b"", "is not a PNG"),
-    "a JPEG": (b"\xff\xd8\xff\xe0" + bytes(64), "is not a PNG"),
-    "a signature": (png()[:8], "ends inside a PNG chunk"),
-    "half": (png()[:60], "ends inside a PNG chunk"),
-    "another size": (png(width=17), "is 17 x 12 pixels"),
-    "a huge size": (png(width=2**31 - 1, height=2**31 - 1, data=b""), "is 2147483647 x 2147483647 pixels"),
-    "16 bits": (png(bits=16), "has bit depth 16, colour type 6"),
-    "a palette": (png(colour=3), "has bit depth 8, colour type 3"),
-    "interlaced": (png(interlace=1), "interlacing 1"),
-    "little data": (png(data=zlib.compress(bytes(100))), "more or less data"),
-    "data without end": (png(data=zlib.compress(bytes(12 * 65))[:-4]), "more or less data"),
-    "a bomb": (png(data=zlib.compress(bytes(1 << 26), 9)), "more or less data"),
-    "no compression": (png(data=b"\0" * 100), "is a damaged picture"),
-    "an unknown filter": (png(data=zlib.compress(b"\5" * 12 * 65)), "an unknown filter"),
-    "a wrong check sum": (png(before=chunk(b"IDAT", b"", 1)), "a wrong check sum"),
-    "a palette beside": (png(before=chunk(b"PLTE", bytes(3))), "holds a PNG chunk b'PLTE'"),
-    "an animation": (png(before=chunk(b"acTL", bytes(8))), "holds a PNG chunk b'acTL'"),
-    "two headers": (png(before=png()[8:33]), "holds a PNG chunk b'IHDR'"),
-    "no header": (b"\x89PNG\r\n\x1a\n" + chunk(b"IEND", b""), "holds a PNG chunk b'IEND'"),
-    "a short header": (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", b"12"), "a PNG header of 2 bytes"),
-    "a chunk beyond the end": (png()[:33] + struct.pack(">I", 2**32 - 1) + b"IDAT" + bytes(16), "ends inside"),
-    "no data": (png()[:33] + chunk(b"IEND", b""), "more or less data"),
-    "more after the end": (png() + b"x", "1 bytes after its last PNG chunk"),
-}
-
-
-@pytest.mark.parametrize("name", PNGS)
-def test_pictures_are_checked(folder, name):
-    content, match = PNGS[name]
-    rewritten(folder, lambda members: members.update({"00000000.00.png": content}))
-    refused(folder, f"00000000.00.png: .*{match}", TAR)
-
-
-def test_a_valid_picture_made_by_hand_is_read(folder):
-    rewritten(folder, lambda members: members.update({"00000000.00.png": png()}))
-    assert not read_all(folder)[0].mask[0].any()
-
-
-def mutated(rng, content, fewest=1, most=4):
-    content = bytearray(content)
-    for _ in range(int(rng.integers(fewest, most + 1))):
-        kind, at = rng.integers(10), int(rng.integers(len(content)))
-        if kind == 0:
-            del content[at : at + int(rng.integers(1, 64))]
-        elif kind == 1:
-            content[at:at] = rng.integers(0, 256, int(rng.integers(1, 64)), np.uint8).tobytes()
-        elif kind == 2:
-            content[at] = rng.choice(np.frombuffer(b'\x00\xff0{}[],:"-', np.uint8))
-        else:
-            content[at] = int(rng.integers(256))
-        if not content:
-            break
-    return bytes(content)
-
-
-def judged(run):
-    try:
-        run()
-    except DataError:
-        return "refused"
-    except Exception as error:
-        return f"{type(error).__name__}: {error}"[:300]
-    return "read"
-
-
 def listing(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
@@ -435,35 +330,3 @@ def test_mutated_shards_are_refused_or_read(tmp_path, what):
     assert set(came) <= {"refused", "read"}
     assert came.count("refused") > 100
     assert listing(tmp_path) == before
-
-
-@pytest.mark.parametrize("kind", [RGBA, DEPTH])
-def test_mutated_pictures_are_refused_or_read(kind):
-    """With check sums made to fit, so that inflating and filters are reached."""
-    rng = np.random.default_rng(0)
-    shape = (12, 16, 4) if kind is RGBA else (12, 16)
-    pixels = np.cumsum(rng.integers(0, 3, shape), axis=1).astype(kind.dtype)
-    content = encode_png(pixels)
-    header, data = content[:33], content[41:-16]
-    raw = zlib.decompress(data)
-
-    def judge(number):
-        rng = np.random.default_rng([number, 7])
-        if number % 3 == 0:
-            damaged = mutated(rng, content)
-        elif number % 3 == 1:
-            damaged = header + chunk(b"IDAT", mutated(rng, data)) + chunk(b"IEND", b"")
-        else:
-            rows = np.frombuffer(raw, np.uint8).copy().reshape(12, -1)
-            rows[:, 0] = rng.integers(0, 5 + (number % 2), 12)  # any filters, half of the time one that does not exist
-            damaged = header + chunk(b"IDAT", zlib.compress(rows.tobytes())) + chunk(b"IEND", b"")
-
-        def run():
-            found = decode_png(damaged, (12, 16), kind, "memory")
-            assert (found.shape, found.dtype) == (shape, kind.dtype)
-
-        return judged(run)
-
-    came = forked.outcomes(range(600), judge)
-    assert set(came) == {"refused", "read"}
-    assert came.count("read") > 100

@@ -1,0 +1,67 @@
+"""Damaging shards, and saying what became of reading them."""
+
+import io
+import tarfile
+
+import numpy as np
+import pytest
+
+from lsmgeo.data import ShardSet
+from lsmgeo.errors import DataError
+
+TAR, SIDECAR = "set-000000.tar", "set-000000.json"
+
+
+def read_all(folder):
+    shards = ShardSet(folder)
+    samples = [shards.read(index, occupancy=8) for index in range(len(shards))]
+    for sample in samples:
+        assert all(tensor.isfinite().all() for tensor in (sample.images, sample.depth, *sample.cameras[:2]))
+    return samples
+
+
+def refused(folder, match, file):
+    with pytest.raises(DataError, match=match) as caught:
+        read_all(folder)
+    assert str(caught.value.path) == str(folder / file)
+    assert str(folder / file) in str(caught.value)
+
+
+def rewritten(folder, change):
+    """The shard without its sidecar, members changed by ``change(members)``."""
+    (folder / SIDECAR).unlink()
+    with tarfile.open(folder / TAR) as tar:
+        members = {info.name: tar.extractfile(info).read() for info in tar.getmembers()}
+    change(members)
+    with tarfile.open(folder / TAR, "w", format=tarfile.USTAR_FORMAT) as tar:
+        for name, content in members.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            tar.addfile(info, io.BytesIO(content))
+
+
+def mutated(rng, content, fewest=1, most=4):
+    content = bytearray(content)
+    for _ in range(int(rng.integers(fewest, most + 1))):
+        kind, at = rng.integers(10), int(rng.integers(len(content)))
+        if kind == 0:
+            del content[at : at + int(rng.integers(1, 64))]
+        elif kind == 1:
+            content[at:at] = rng.integers(0, 256, int(rng.integers(1, 64)), np.uint8).tobytes()
+        elif kind == 2:
+            content[at] = rng.choice(np.frombuffer(b'\x00\xff0{}[],:"-', np.uint8))
+        else:
+            content[at] = int(rng.integers(256))
+        if not content:
+            break
+    return bytes(content)
+
+
+def judged(run):
+    try:
+        run()
+    except DataError:
+        return "refused"
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"[:300]
+    return "read"

@@ -388,21 +388,16 @@ def test_backgrounds_from_a_folder(tmp_path):
         shards.read(0, background="whlte", occupancy=8)
 
 
-def test_drawn_backgrounds(tmp_path, monkeypatch):
+def test_drawn_backgrounds(tmp_path):
     """One for each view, drawn with the generator that was given."""
-    shapes = write_set(tmp_path, shards=1)
-
-    def background(generator, height, width):
-        return torch.full((3, height, width), generator.random())
-
-    monkeypatch.setattr(scenes, "background", background, raising=False)
-    sample = ShardSet(tmp_path).read(
-        2, views=[1, 0], occupancy=8, background="random", generator=np.random.default_rng(4)
-    )
-    drawn = np.random.default_rng(4).random(2)
-    colours, mask = shapes[2].pixels[[1, 0]] / np.float32(255), shapes[2].mask[[1, 0]][..., None]
-    expected = np.where(mask, colours, drawn[:, None, None, None])
-    np.testing.assert_array_equal(sample.images.permute(0, 2, 3, 1).numpy(), expected.astype(np.float32))
+    shape = write_set(tmp_path, shards=1)[2]
+    options = {"views": [1, 0], "occupancy": 8, "background": "random", "generator": np.random.default_rng(4)}
+    sample = ShardSet(tmp_path).read(2, **options)
+    generator = np.random.default_rng(4)
+    behind = np.stack([scenes.background(generator, 12, 16).permute(1, 2, 0).numpy() for _ in range(2)])
+    assert not np.array_equal(behind[0], behind[1])
+    colours, mask = shape.pixels[[1, 0]] / np.float32(255), shape.mask[[1, 0]][..., None]
+    np.testing.assert_array_equal(sample.images.permute(0, 2, 3, 1).numpy(), np.where(mask, colours, behind))
 
 
 def test_names_are_unique_in_a_set(tmp_path):

@@ -6,6 +6,8 @@ ORDER = [
     "plot_half_pixel_mistake.py",
     "plot_plane_sweep_sphere.py",
     "plot_pose_noise.py",
+    "plot_analytic_scene.py",
+    "plot_synthetic13.py",
 ]
 
 

@@ -38,6 +38,8 @@ MAY_IMPORT = {
     "rays": SHARED | {"functional", "grids", "kernels", "_sites"},
 }
 OUTSIDE_THE_CORE = {"models", "data", "classical", "scenes", "metrics", "cli", "demo"}
+# What the parts outside may import of each other; the core is open to all of them.
+MAY_ALSO_IMPORT = {"scenes": set(), "data": {"scenes"}, "metrics": set()}
 HEAVY = {"cv2", "trimesh", "skimage", "matplotlib", "jsonargparse", "triton", "scipy", "tqdm", "PIL"}
 
 
@@ -84,6 +86,18 @@ def test_the_core_imports_along_the_arrows(module):
     assert violations(module, names) == set()
     allowed = {"triton"} if module.startswith("lsmgeo.kernels.gpu_") else set()  # loaded with the first call
     assert {name.split(".")[0] for name in names} & HEAVY <= allowed
+
+
+@pytest.mark.parametrize("module", [module for module in MODULES if part(module) in MAY_ALSO_IMPORT])
+def test_data_and_scenes_stand_below_models(module):
+    own = {part(name) for name in imported(MODULES[module], module) if name.split(".")[0] == "lsmgeo"}
+    assert own & OUTSIDE_THE_CORE <= MAY_ALSO_IMPORT[part(module)] | {part(module)}
+
+
+@pytest.mark.parametrize("package", ["lsmgeo.scenes", "lsmgeo.scenes.synthetic13", "lsmgeo.data"])
+def test_scenes_and_data_import_lightly(package):
+    new = {name.split(".")[0] for name in loaded_by(f"import {package}") - loaded_by("import torch, kornia.geometry")}
+    assert new & (HEAVY | {"embreex", "manifold3d", "joblib", "distributed", "webdataset"}) == set()
 
 
 @pytest.mark.parametrize("module", MODULES)

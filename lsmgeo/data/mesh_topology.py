@@ -11,8 +11,11 @@ __all__ = [
     "Parts",
     "are_real",
     "components",
+    "corner_normals",
+    "disagreeing",
     "distinct_faces",
     "edges_of",
+    "face_normals",
     "is_watertight",
     "merged_faces",
     "parts_of",
@@ -128,6 +131,29 @@ def parts_of(faces: np.ndarray) -> Parts:
     copies[order] = np.bincount(group)[group]
     doubled = 2 * np.bincount(part, weights=copies > 1, minlength=count) > np.bincount(part, minlength=count)
     return Parts(part, closed, oriented, doubled)
+
+
+def disagreeing(faces: np.ndarray) -> np.ndarray:
+    """Which faces to reverse, (F,) bool, so that neighbours over edges of two faces agree, as far as that can be.
+
+    Every face has two states, as it is and reversed, and each edge of two faces links the states that agree. All that
+    is linked to the first face of a group as it is stays or turns with it; on a one-sided surface nothing turns.
+    """
+    edges = edges_of(faces)
+    first = np.flatnonzero((edges.edge[1:] == edges.edge[:-1]) & (np.bincount(edges.edge)[edges.edge[1:]] == 2))
+    one, two = edges.face[first], edges.face[first + 1]
+    across = np.where(edges.forward[first] == edges.forward[first + 1], 1, 0)
+    count = len(faces)
+    state = components(
+        2 * count,
+        np.concatenate((one, one + count)),
+        np.concatenate((two + across * count, two + (1 - across) * count)),
+    )
+    group = components(count, one, two)
+    leader = np.zeros(group.max() + 1, np.int64)
+    leader[group[::-1]] = np.arange(count)[::-1]  # the last to be written is the first face
+    kept = state[:count] == state[leader[group]]
+    return ~kept
 
 
 def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

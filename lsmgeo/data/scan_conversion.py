@@ -25,6 +25,8 @@ __all__ = [
 
 # Largest number of (triangle, row) or (triangle, column) pairs held at once.
 CHUNK = 1 << 21
+# Less of a normal along an axis than this cannot carry a surface past the next voxel along another axis.
+SLOPE = 0.25
 
 Shape = tuple[int, int, int]
 
@@ -63,12 +65,14 @@ class Crossings(NamedTuple):
         row: (K,) which line, its second coordinate after the shear.
         place: (K,) float64 where along the line.
         sign: (K,) int8, +1 or -1, which side of the triangle the line meets; 0 on a triangle seen edge-on.
+        face: (K,) which triangle.
     """
 
     column: np.ndarray
     row: np.ndarray
     place: np.ndarray
     sign: np.ndarray
+    face: np.ndarray
 
 
 def sheared(points: np.ndarray, line: Line) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -120,7 +124,7 @@ def crossings(triangles: np.ndarray, shape: Shape, line: Line) -> Iterator[Cross
             f, r = face[pair], row[pair]
             place = _place(u[f], v[f], along[f], normal[f], column, r)
             sign = np.sign(normal[f]).astype(np.int8)
-            yield Crossings(column.astype(np.int64), r.astype(np.int64), place, sign)
+            yield Crossings(column.astype(np.int64), r.astype(np.int64), place, sign, f)
 
 
 def crossing_counts(triangles: np.ndarray, shape: Shape, line: Line, *, signed: bool) -> np.ndarray:
@@ -128,12 +132,12 @@ def crossing_counts(triangles: np.ndarray, shape: Shape, line: Line, *, signed: 
 
     Returns:
         (length + 1, columns, rows) int32; the last entry counts those behind every centre. A crossing exactly in a
-        centre counts as behind it.
+        centre counts as in front of it, as an edge does that a line meets exactly.
     """
     (column_low, columns), (row_low, rows), length = _size(shape, line)
     counts = np.zeros((length + 1) * columns * rows, np.int32)
     for found in crossings(triangles, shape, line):
-        step = np.clip(np.floor(found.place) + 1, 0, length).astype(np.int64)
+        step = np.clip(np.ceil(found.place), 0, length).astype(np.int64)
         index = (step * columns + (found.column - column_low)) * rows + (found.row - row_low)
         np.add.at(counts, index, found.sign.astype(np.int32) if signed else np.int32(1))
     return counts.reshape(length + 1, columns, rows)
@@ -151,18 +155,25 @@ def first_and_last(triangles: np.ndarray, shape: Shape, line: Line) -> tuple[np.
 
 
 def cells_touched(triangles: np.ndarray, shape: Shape, finer: int = 4) -> np.ndarray:
-    """Which voxels a surface passes through, (W, H, D) bool, seen along the axes of a ``finer`` lattice."""
-    touched = np.zeros(shape, bool)
+    """Which voxels a surface passes through, seen along the axes of a lattice ``finer`` times as fine.
+
+    Returns:
+        (W, H, D) uint8, 0 where no surface is; else the sum of 1, 2 and 4 for x, y and z, the axes along which a normal
+        of the surface there has a part, of `SLOPE` or more of its largest.
+    """
+    touched = np.zeros(shape, np.uint8)
     fine = (triangles + 0.5) * finer - 0.5
     fine_shape = (shape[0] * finer, shape[1] * finer, shape[2] * finer)
+    normal = np.abs(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]))
+    axes = ((normal >= SLOPE * normal.max(1, keepdims=True)) @ np.array([1, 2, 4])).astype(np.uint8)
     for line in LINES[:3]:
         first, second = line.others
         cells = np.moveaxis(touched, (first, second, line.axis), (0, 1, 2))
         for found in crossings(fine, fine_shape, line):
             step = np.floor(found.place + 0.5)
             within = (step >= 0) & (step < fine_shape[line.axis])
-            step = step[within].astype(np.int64)
-            cells[found.column[within] // finer, found.row[within] // finer, step // finer] = True
+            index = tuple(place[within].astype(np.int64) // finer for place in (found.column, found.row, step))
+            np.bitwise_or.at(cells, index, axes[found.face[within]])
     return touched
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lsmgeo._checks import check_choice, check_flag
-from lsmgeo.data.mesh_topology import Parts, are_real, distinct_faces, merged_faces, parts_of
+from lsmgeo.data.mesh_topology import Parts, are_real, disagreeing, distinct_faces, merged_faces, parts_of
 from lsmgeo.data.meshes import Mesh, check_mesh
 from lsmgeo.data.scan_conversion import LINES, Line, cells_touched, crossing_counts, first_and_last, line_extent
 from lsmgeo.errors import OptionError
@@ -31,8 +31,8 @@ class Plan(NamedTuple):
     """How ``method="auto"`` treats the faces of a mesh, each (K, 3) by vertex number.
 
     Attributes:
-        closed: closed parts whose faces agree on what is outside, turned outwards; the winding number decides.
-        unoriented: closed parts whose faces do not agree; parity decides.
+        closed: closed parts, faces turned to agree and outwards; the winding number decides.
+        unoriented: closed parts whose faces cannot be made to agree, as some edges have more than two; parity decides.
         sheets: parts with holes; thirteen directions vote on the winding number.
         unoriented_sheets: parts with holes whose faces do not agree either; the vote is on parity.
     """
@@ -67,17 +67,18 @@ def voxelise(
       overlaps and faces drawn twice; any hole lets much escape, and deep hollows fill.
     - "surface": every voxel that the surface passes through (seen on a grid four times as fine) and what they
       enclose; up to half a voxel too thick everywhere.
-    - "auto": each part connected through edges by what it is: closed parts by winding number (turned outwards first,
-      unless they hollow out another part) or, where its faces disagree, by parity; parts with holes by vote; second
-      copies of faces that make a part visible from both sides are left out. With ``keep_thin``.
+    - "auto": each part connected through edges by what it is: closed parts by winding number, their faces made to
+      agree and turned outwards first (unless they hollow out another part); closed parts that no turning makes agree
+      by parity; parts with holes by vote; second copies of faces that make a part visible from both sides are left
+      out. With ``keep_thin``.
 
     Args:
         mesh: (N, 3) vertices in world units and (F, 3) faces.
         resolution: voxels along each side, or (D, H, W); 512 at most.
         method: one of the above.
         keep_thin: add what is thinner than a voxel and would be lost: the voxels that the surface passes through
-            where no solid voxel is near. By default only with "auto", without which "winding" is strictly
-            solid-by-centre.
+            where no solid voxel is next to them, as seen along the surface's normals. By default only with "auto";
+            without it, all but "surface" are strictly solid-by-centre.
         lower: lower bounds of the grid, world units, a number or (x, y, z).
         upper: upper bounds.
 
@@ -124,7 +125,7 @@ def voxelise(
     else:
         from scipy import ndimage
 
-        solid = ndimage.binary_fill_holes(cells_touched(triangles, count))
+        solid = ndimage.binary_fill_holes(cells_touched(triangles, count) > 0)
     if keep_thin:
         solid = _with_thin(solid, cells_touched(triangles, count))
     return torch.from_numpy(np.ascontiguousarray(solid.transpose(2, 1, 0)))
@@ -152,6 +153,11 @@ def plan_voxels(mesh: Mesh) -> Plan:
         twice = parts.doubled[parts.part]
         kept = np.sort(np.concatenate((np.flatnonzero(~twice), np.flatnonzero(twice)[distinct_faces(merged[twice])])))
         merged, faces = merged[kept], faces[kept]
+        parts = parts_of(merged)
+    if (parts.closed & ~parts.oriented).any():
+        turned = (parts.closed & ~parts.oriented)[parts.part]
+        turned[turned] = disagreeing(merged[turned])
+        merged, faces = (np.where(turned[:, None], names[:, ::-1], names) for names in (merged, faces))
         parts = parts_of(merged)
     closed, oriented = parts.closed[parts.part], parts.oriented[parts.part]
     outward = _outward(mesh.vertices, faces, parts)
@@ -265,16 +271,38 @@ def _enclosed(triangles: np.ndarray, count: Shape) -> np.ndarray:
         slabs = np.moveaxis(enclosed, line.axis, 0)
         for step in range(count[line.axis]):
             window = _window(count, line, step)
-            slabs[step] &= (first[window] < step) & (last[window] >= step)
+            slabs[step] &= (first[window] <= step) & (last[window] > step)
     return enclosed
 
 
 def _with_thin(solid: np.ndarray, touched: np.ndarray) -> np.ndarray:
-    """Add the touched voxels that have no solid voxel near, and those that join them to the rest."""
-    from scipy import ndimage
+    """Add touched voxels that no solid voxel stands for.
 
-    near = np.ones((3, 3, 3), bool)
-    thin = touched & ~ndimage.binary_dilation(solid, near)
-    if not thin.any():
+    One stands for the surface in a voxel if it is next to it along the axes of the surface's normals there: behind a
+    face, across an edge. Past the side of a rod, the next piece of the rod does not.
+    """
+    lost = np.zeros_like(solid)
+    # A face that just grazes a voxel may have been seen in the next one only.
+    normals = touched
+    for axis in range(3):
+        normals = _spread(normals, axis)
+    normals = np.where(touched > 0, normals, 0)
+    for axes in range(1, 8):
+        near = solid
+        for axis in range(3):
+            near = _spread(near, axis) if axes >> axis & 1 else near
+        lost |= (normals == axes) & ~near
+    if not lost.any():
         return solid
-    return solid | (touched & ndimage.binary_dilation(thin, near))
+    # Where a rod meets a board, both pass through one voxel, and the board stands for it: join them.
+    beside_lost, beside_solid = (np.any([_spread(cells, axis) for axis in range(3)], axis=0) for cells in (lost, solid))
+    return solid | lost | ((touched > 0) & beside_lost & beside_solid)
+
+
+def _spread(cells: np.ndarray, axis: int) -> np.ndarray:
+    """Cells or-ed with their two neighbours along an axis."""
+    result = cells.copy()
+    there, here = (np.moveaxis(array, axis, 0) for array in (result, cells))
+    there[1:] |= here[:-1]
+    there[:-1] |= here[1:]
+    return result

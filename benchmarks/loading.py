@@ -1,7 +1,7 @@
 """What feeding a training run from shards costs: ``python -m benchmarks.loading``.
 
-A set of analytic shapes is rendered, written as shards, and read as a trainer reads it: by a loader's workers, in
-random order, some views of each shape. Files are in the cache; the trainer itself does nothing.
+A set of synthetic shapes is rendered and read as a trainer reads it: by a loader's workers, in random order, some views
+of each shape. Files are in the cache; the trainer itself does nothing.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import argparse
 import statistics
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,50 +18,10 @@ import torch
 from torch.utils.data import DataLoader
 
 from benchmarks import timing
-from lsmgeo import scenes
-from lsmgeo.cameras import CameraTensors
-from lsmgeo.data import EpochSampler, Sample, ShapeDataset, ShardSet, collate, encode_sample, hash_settings, write_shard
-from lsmgeo.scenes import synthetic13
+from lsmgeo.data import EpochSampler, Recipe, ShapeDataset, ShardSet, collate, render_set
 
 VIEWS, SIZE = 20, 224
 GOALS = {True: 60.0, False: 120.0}  # shapes a second, with and without depth
-
-
-def rendered(index: int, views: int, size: int) -> tuple[Sample, torch.Tensor]:
-    """One shape with its views and 32^3 occupancy, and its occupancy on 64^3."""
-    made = synthetic13.shape(0, index)
-    cameras = synthetic13.views(0, index, views, size)
-    stacked = CameraTensors(*(torch.as_tensor(field)[None] for field in cameras))
-    lights = scenes.Lights(*(field[None] for field in made.lights))
-    picture = scenes.render([made.scene], stacked, lights)
-    grids = {}
-    for n in (32, 64):
-        axis = (torch.arange(n, dtype=torch.float64) + 0.5) / n - 0.5
-        z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
-        grids[n] = scenes.occupancy([made.scene], torch.stack((x, y, z), -1)[None])[0]
-    images, depth, mask = picture.images[0], picture.depth[0], picture.mask[0]
-    return Sample(images, cameras, depth, mask, grids[32], None, made.category, made.name), grids[64]
-
-
-def write(folder: Path, options: argparse.Namespace) -> dict[str, float]:
-    """Write the set; what a shape takes on disk, and the encoding of a view."""
-    seconds, sizes = [], []
-    different = [rendered(index, options.views, options.size) for index in range(options.different)]
-
-    def items() -> Iterator[tuple[int, dict[str, bytes]]]:
-        for key in range(options.shapes):
-            sample, grid = different[key % options.different]
-            started = time.perf_counter()
-            members = encode_sample(sample._replace(name=f"shape-{key}"), key, more_occupancy=[grid])
-            seconds.append(time.perf_counter() - started)
-            sizes.append(sum(map(len, members.values())))
-            yield key, members
-
-    write_shard(folder / "set-000000.tar", items(), hash_settings({"benchmark": "loading"}))
-    return {
-        "shape_kB": statistics.mean(sizes) / 1e3,
-        "encode_view_ms": 1e3 * statistics.median(seconds) / options.views,
-    }
 
 
 def alone(dataset: ShapeDataset, epoch: int) -> float:
@@ -105,13 +65,14 @@ def measure(folder: Path, options: argparse.Namespace) -> list[dict[str, Any]]:
                 times[depth].append(milliseconds)
     return [
         {
-            "case": f"{options.taken} of {options.views} views, {options.size}^2, {'with' if depth else 'no'} depth",
+            "case": f"{options.taken} of {options.views} views, {options.size} x {options.size}, {'with' if depth else 'no'} depth",
             "workers": options.workers,
             "batch": options.batch,
-            "shapes_per_s": statistics.median(rates[depth]),
+            "unit": "shapes/s",
+            "rate": statistics.median(rates[depth]),
             "slowest": min(rates[depth]),
             "fastest": max(rates[depth]),
-            "goal": GOALS[depth],
+            "target": GOALS[depth],
             "one_process_ms": statistics.median(times[depth]),
             "one_process_least_ms": min(times[depth]),
             "passes": options.passes,
@@ -123,23 +84,26 @@ def measure(folder: Path, options: argparse.Namespace) -> list[dict[str, Any]]:
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--shapes", type=int, default=208)
-    parser.add_argument("--different", type=int, default=26, help="shapes rendered; the others are copies of these")
     parser.add_argument("--views", type=int, default=VIEWS)
     parser.add_argument("--taken", type=int, default=4, help="views of a shape that a step takes")
     parser.add_argument("--size", type=int, default=SIZE)
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--passes", type=int, default=7)
-    parser.add_argument("--results", type=Path, default=timing.RESULTS)
+    parser.add_argument("--quick", action="store_true", help="see whether it works")
     options = parser.parse_args(argv)
+    if options.quick:
+        options.shapes, options.views, options.size, options.passes = 8, 4, 64, 1
     where = timing.machine("cpu")
-    with tempfile.TemporaryDirectory(prefix="lsmgeo-loading-") as folder:
-        written = write(Path(folder), options)
+    with tempfile.TemporaryDirectory() as folder:
+        made = render_set("synthetic-13", folder, Recipe(views=options.views, size=options.size), shapes=options.shapes)
+        size = sum(path.stat().st_size for path in made.shards) / made.shapes
         cases = measure(Path(folder), options)
-    columns = {"case": "", "shapes_per_s": ".0f", "slowest": ".0f", "fastest": ".0f", "goal": ".0f"}
+    columns = {"case": "", "rate": ".0f", "slowest": ".0f", "fastest": ".0f", "target": ".0f"}
     timing.table(cases, {**columns, "one_process_ms": ".1f", "one_process_least_ms": ".1f"})
-    print(f"{written['shape_kB']:.0f} kB a shape, {written['encode_view_ms']:.1f} ms to encode a view")
-    print(timing.save("loading", where, cases, options.results, **written))
+    print(f"{size / 1e3:.0f} kB a shape on disk")
+    if not options.quick:
+        print(timing.save("loading", where, cases, bytes_per_shape=size))
 
 
 if __name__ == "__main__":

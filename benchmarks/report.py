@@ -111,3 +111,16 @@ def show(rows: Rows, title: str = "") -> None:
         print(f"\n{title}")
     for row in rows:
         print("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip(), flush=True)
+
+
+def rate_rows(cases: Sequence[Mapping[str, Any]]) -> Rows:
+    """Work, what was reached, the goal where there is one, and whether it is met."""
+    rows = [["work", "median", "slowest to fastest", "goal", ""]]
+    for case in cases:
+        spread = f"{case['slowest']:.0f} to {case['fastest']:.0f}" if "slowest" in case else "one run"
+        target = case.get("target")
+        met = "" if target is None else "met" if case["rate"] >= target else "**missed**"
+        rows.append(
+            [case["case"], f"{case['rate']:.0f} {case['unit']}", spread, f"{target:.0f}" if target else "—", met]
+        )
+    return rows

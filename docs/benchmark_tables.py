@@ -26,6 +26,7 @@ TABLES: dict[str, Callable[[list[dict[str, Any]]], report.Rows]] = {
     "memory": lambda cases: report.memory_rows([case for case in cases if "memory" in case]),
     "compiling": report.first_call_rows,
     "left-out": report.left_out_rows,
+    "rates": report.rate_rows,
 }
 
 

@@ -63,9 +63,10 @@ def measure(folder: Path, options: argparse.Namespace) -> list[dict[str, Any]]:
             if number:  # the first pass starts the workers
                 rates[depth].append(rate)
                 times[depth].append(milliseconds)
+    what = f"{options.taken} of {options.views} views, {options.size} x {options.size}"
     return [
         {
-            "case": f"{options.taken} of {options.views} views, {options.size} x {options.size}, {'with' if depth else 'no'} depth",
+            "case": f"{what}, {'with' if depth else 'no'} depth",
             "workers": options.workers,
             "batch": options.batch,
             "unit": "shapes/s",

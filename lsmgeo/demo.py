@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lsmgeo import PlaneSweepProject, Unproject, VoxelGrid, depth_planes
+from lsmgeo import PlaneSweepProject, Unproject, VoxelGrid, depth_planes, scenes
 from lsmgeo.cameras import CameraTensors, orbit, rays
 
 if TYPE_CHECKING:
@@ -78,34 +78,28 @@ def _texture(points: Tensor) -> Tensor:
     return 0.5 + 0.25 * (waves[..., :3] + waves[..., 3:])
 
 
-def _trace(cameras: CameraTensors, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Ray trace the sphere and the floor: images (V, 3, H, W), camera z (V, H, W), and surface points (V, H, W, 3).
+def _picture(
+    cameras: CameraTensors, scene: scenes.Scene, lower: Tensor, upper: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The textured scene: images (V, 3, H, W), camera z (V, H, W), and surface points (V, H, W, 3).
 
-    The nearer root of ``|C + s d|^2 = r^2``, or ``s = (floor - C_y) / d_y``, whichever comes first; rays that hit
-    nothing inside the box have depth 0.
+    Surfaces outside the box are left out; their depth is 0.
     """
+    batch = CameraTensors(*(torch.as_tensor(value)[None] for value in cameras))
+    dark = scenes.Lights(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(3))
+    depth = scenes.render([scene], batch, dark, dtype=torch.float64).depth[0]
     origins, directions = rays(cameras)
-    origins = origins[:, None, None]
-    along = (origins * directions).sum(-1)
-    discriminant = along.square() - (origins.square().sum(-1) - RADIUS**2)
-    sphere = torch.where(discriminant >= 0, -along - discriminant.clamp_min(0).sqrt(), torch.inf)
-    sphere = torch.where(sphere > 0, sphere, torch.inf)
-    down = directions[..., 1] < 0
-    floor = torch.where(down, (FLOOR - origins[..., 1]) / torch.where(down, directions[..., 1], -1.0), torch.inf)
-    distance = torch.minimum(sphere, floor)
-    hit = distance.isfinite()
-    points = origins + directions * torch.where(hit, distance, 0.0)[..., None]
-    hit = hit & ((points >= lower) & (points <= upper)).all(-1)
+    along = (directions * cameras.cam_from_world[:, None, None, 2, :3]).sum(-1)  # camera z of a unit step
+    points = origins[:, None, None] + directions * (depth / along)[..., None]
+    hit = (depth > 0) & ((points >= lower) & (points <= upper)).all(-1)
     # Noise, different in every view: a plain background would agree with itself in empty space.
     noise = torch.rand(points.shape[:-1], generator=torch.Generator().manual_seed(0), dtype=points.dtype)
     colours = torch.where(hit[..., None], _texture(points), noise[..., None])
-    forward = cameras.cam_from_world[:, None, None, 2, :3]
-    depth = torch.where(hit, distance * (directions * forward).sum(-1), 0.0)
-    return colours.permute(0, 3, 1, 2), depth, points
+    return colours.permute(0, 3, 1, 2), torch.where(hit, depth, 0.0), points
 
 
-def _seen_by(points: Tensor, cameras: CameraTensors) -> Tensor:
-    """How many cameras see each surface point (..., 3): in the picture, and with the sphere not in between."""
+def _seen_by(points: Tensor, cameras: CameraTensors, scene: scenes.Scene) -> Tensor:
+    """How many cameras see each surface point (..., 3): in the picture, and with nothing in between."""
     count = torch.zeros(points.shape[:-1], dtype=torch.int64)
     sizes = (torch.as_tensor(size) for size in cameras[2:])
     for K, E, height, width in zip(cameras.intrinsics, cameras.cam_from_world, *sizes, strict=True):
@@ -113,13 +107,10 @@ def _seen_by(points: Tensor, cameras: CameraTensors) -> Tensor:
         pixel = camera @ K.T
         x, y = pixel[..., 0] / pixel[..., 2], pixel[..., 1] / pixel[..., 2]
         inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
-        step = -E[:3, :3].T @ E[:3, 3] - points  # from the point to the centre
-        length = step.norm(dim=-1)
-        along = (points * step).sum(-1) / length
-        discriminant = along.square() - (points.square().sum(-1) - RADIUS**2)
-        # The far root is positive where the sphere is in the way, and 0 at its own points that face the camera.
-        blocked = (discriminant > 0) & (-along + discriminant.clamp_min(0).sqrt() > 1e-3)
-        count += inside & ~blocked
+        center = -E[:3, :3].T @ E[:3, 3]
+        towards = (points - center).reshape(1, -1, 3)
+        first = scenes.trace([scene], center.expand_as(towards), towards).distance.view(count.shape)
+        count += inside & (first > 1 - 1e-3)
     return count
 
 
@@ -142,7 +133,8 @@ def run_demo(*, size: tuple[int, int] = (120, 160), voxels: int = 72, planes: in
     cameras = orbit(azimuths, elevations, 2.4, focal_length=1.45 * width, height=height, width=width)
     grid = VoxelGrid((voxels, voxels * 2 // 3, voxels), lower=(-0.75, -0.5, -0.75), upper=(0.75, 0.5, 0.75))
     lower, upper = torch.tensor(grid.lower).double(), torch.tensor(grid.upper).double()
-    images, depths, points = _trace(cameras, lower, upper)
+    scene = scenes.Scene([scenes.sphere((0, 0, 0), RADIUS), scenes.half_space((0, FLOOR, 0), (0, 1, 0))])
+    images, depths, points = _picture(cameras, scene, lower, upper)
     images = images.float()
 
     start = time.perf_counter()
@@ -159,7 +151,7 @@ def run_demo(*, size: tuple[int, int] = (120, 160), voxels: int = 72, planes: in
     seconds = time.perf_counter() - start
 
     truth = depths[view]
-    surface = (truth > 0) & (_seen_by(points[view], cameras) >= 3)
+    surface = (truth > 0) & (_seen_by(points[view], cameras, scene) >= 3)
     error = torch.where(surface, (depth - truth).abs() / truth.clamp_min(1e-6), torch.nan)
     return DemoResult(images, cameras, grid, agreement[0, 0], view, truth, depth, error, seconds)
 

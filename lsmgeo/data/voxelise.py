@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -227,22 +227,21 @@ def _by_vote(triangles: np.ndarray, count: Shape, lines: Sequence[Line], *, sign
         balanced = total == 0 if signed else total % 2 == 0
         running = np.zeros_like(total)
         slabs = np.moveaxis(votes, line.axis, 0)
-        for step in range(count[line.axis]):
+        for step, window in _windows(count, line):
             running += change[step]
-            window = _window(count, line, step)
             passed = running[window]
             inside = passed != 0 if signed else passed % 2 != 0
             slabs[step] += np.where(balanced[window], np.where(inside, 1, -1), 0).astype(np.int8)
     return _decided(votes)
 
 
-def _window(count: Shape, line: Line, step: int) -> tuple[slice, slice]:
-    """Which lines pass through the centres of one slab: shearing shifts a window over the columns and rows."""
-    sides = []
-    for index in (0, 1):
-        start = -line.slopes[index] * step - line_extent(count, line, index)[0]
-        sides.append(slice(start, start + count[line.others[index]]))
-    return sides[0], sides[1]
+def _windows(count: Shape, line: Line) -> Iterator[tuple[int, tuple[slice, slice]]]:
+    """Which lines pass through the centres of each slab: shearing shifts a window over the columns and rows."""
+    lows = [line_extent(count, line, index)[0] for index in (0, 1)]
+    columns, rows = (count[axis] for axis in line.others)
+    for step in range(count[line.axis]):
+        column, row = (-slope * step - low for slope, low in zip(line.slopes, lows, strict=True))
+        yield step, (slice(column, column + columns), slice(row, row + rows))
 
 
 def _decided(votes: np.ndarray) -> np.ndarray:
@@ -269,8 +268,7 @@ def _enclosed(triangles: np.ndarray, count: Shape) -> np.ndarray:
     for line in LINES:
         first, last = first_and_last(triangles, count, line)
         slabs = np.moveaxis(enclosed, line.axis, 0)
-        for step in range(count[line.axis]):
-            window = _window(count, line, step)
+        for step, window in _windows(count, line):
             slabs[step] &= (first[window] <= step) & (last[window] > step)
     return enclosed
 

@@ -16,7 +16,7 @@ RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<
 def parse_stl(content: bytes, max_faces: int) -> Parsed:
     """Stereolithography, binary (its size must be what its count says) or text."""
     count = int.from_bytes(content[80:84], "little") if len(content) >= 84 else -1
-    if len(content) == 84 + 50 * count:
+    if count >= 0 and len(content) == 84 + 50 * count:
         if count > max_faces:
             raise Unreadable(f"has {count} faces, the limit is {max_faces}")
         rows = np.frombuffer(content, RECORD, offset=84)

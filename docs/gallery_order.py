@@ -8,6 +8,7 @@ ORDER = [
     "plot_pose_noise.py",
     "plot_analytic_scene.py",
     "plot_synthetic13.py",
+    "plot_mesh_voxels.py",
 ]
 
 

@@ -42,3 +42,8 @@ def test_two_degrees_of_pose_noise_fall_below_a_fifth_of_a_degree(run):
     names = run("pose_noise")
     assert abs(names["errors"][0] - 2.0).max() < 1e-3
     assert names["final"].max() < 0.2
+
+
+def test_a_tenth_of_the_faces_matters_little_to_the_vote(run):
+    names = run("mesh_voxels")
+    assert names["overlap"](names["before"], names["after"]) > 0.98

@@ -73,22 +73,24 @@ def _shelves(p: Parameters, colours: Palette, low: Corner, high: Corner, wall: f
         block((a, b, c), (d, b + wall, f), colours.body),
         block((a, e - wall, c), (d, e, f), colours.body),
     ]
+    left, right = c + wall / 2, f - wall / 2  # shelves end within the sides
     half = p.uniform("shelf_thickness", 0.03, 0.07) / 2
     inside = (a, d - p.uniform("shelf_setback", 0.0, 0.15) * (d - a))
     rows = p.count("shelves", 2, 5) if e - b > 0.8 else p.count("shelves", 1, 2)
     for y in spaced(b, e, rows)[1:] if rows > 1 else [(b + e) / 2]:
         y -= 0.5 * (e - b) / rows if rows > 1 else 0.0
-        parts.append(block((inside[0], y - half, c), (inside[1], y + half, f), colours.trim))
+        parts.append(block((inside[0], y - half, left), (inside[1], y + half, right), colours.trim))
     if uprights:
         columns = p.count("columns", 2, 4)
         for index in range(1, columns):
             place = c + index * (f - c) / columns
             parts.append(block((inside[0], b, place - wall / 2), (inside[1], e, place + wall / 2), colours.trim))
     if p.choice("back", ("closed", "open", "closed")) == "closed":
-        parts.append(block((a, b, c), (a + p.uniform("back_thickness", 0.03, 0.06), e, f), colours.detail))
+        rear = a + p.uniform("back_thickness", 0.03, 0.06)
+        parts.append(block((a, b + wall / 2, left), (rear, e - wall / 2, right), colours.detail))
     else:
         middle, across = (b + e) / 2, p.uniform("brace", 0.06, 0.14)
-        parts.append(block((a, middle - across, c), (a + 0.04, middle + across, f), colours.detail))
+        parts.append(block((a, middle - across, left), (a + 0.04, middle + across, right), colours.detail))
     return parts
 
 

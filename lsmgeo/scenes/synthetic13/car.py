@@ -48,13 +48,16 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
         radius *= 1.2
     x, z, waist = length / 2, width / 2, clearance + belt
     top = waist + cabin
+    windscreen, window = -x + front * length, -x + rear * length
+    # A roof remains between the slopes of a short car.
+    steeper = min(1.0, 0.75 * (front - rear) * length / ((rake + slope) * cabin))
+    rake, slope = steeper * rake, steeper * slope
 
     parts = _body(p, kind, colours, (x, z), clearance, waist)
-    windscreen, window = -x + front * length, -x + rear * length
     if kind == "convertible":
         tub = block((window, clearance + 0.3 * belt, -z + 0.18), (windscreen, waist + 1.0, z - 0.18), colours.dark)
         parts[0] = parts[0].minus(tub)
-        glass = bar((windscreen, waist - 0.03, 0), (windscreen - 0.6 * cabin, top, 0), 0.12, width - 0.3, colours.dark)
+        glass = bar((windscreen, waist - 0.03, 0), (windscreen - 0.6 * cabin, top, 0), 0.12, width - 0.2, colours.dark)
         seats = [
             bar(
                 (s, clearance + 0.25 * belt, 0.24 * width),
@@ -93,7 +96,7 @@ def _body(
     nose = p.uniform("nose_drop", 0.1, 0.35) * (waist - low)
     bonnet = {"van": 0.08, "lorry": 0.04}.get(kind, p.uniform("bonnet", 0.25, 0.36)) * 2 * x
     if kind == "beetle":
-        hull = ellipsoid((0, low + 0.35 * (waist - low), 0), (x, 0.75 * (waist - low), 0.85 * z), colours.body)
+        hull = ellipsoid((0, 0.5 * (low + waist), 0), (x, 0.5 * (waist - low), 0.85 * z), colours.body)
         wings = [
             ellipsoid((s * 0.62 * x, low + 0.3, 0.8 * z), (0.28 * x, 0.4, 0.26 * z), colours.trim) for s in (-1, 1)
         ]
@@ -118,12 +121,12 @@ def _cabin(
     (rear, front), (waist, top) = ends, levels
     if kind == "beetle":
         # One dome in three storeys: body, panes, roof.
-        middle, low, tall = (rear + front) / 2, waist - 0.15, top - waist + 0.15
-        reach = 0.55 * (front - rear)
-        panes = ellipsoid((middle, low, 0), (reach, tall, 0.82 * z), colours.dark)
-        shell = ellipsoid((middle, low, 0), (1.02 * reach, 1.02 * tall, 0.84 * z), colours.body)
-        foot = kept(shell, (0, low + 0.3 * tall, 0), (0, -1, 0))
-        roof = kept(shell, (0, low + 0.78 * tall, 0), (0, 1, 0))
+        middle, tall, reach = (rear + front) / 2, 0.5 * (top - waist) + 0.3, 0.55 * (front - rear)
+        level = top - tall
+        panes = ellipsoid((middle, level, 0), (reach, tall, 0.82 * z), colours.dark)
+        shell = ellipsoid((middle, level, 0), (1.02 * reach, 1.02 * tall, 0.84 * z), colours.body)
+        foot = kept(shell, (0, waist + 0.05, 0), (0, -1, 0))
+        roof = kept(shell, (0, waist + 0.7 * (top - waist), 0), (0, 1, 0))
         pillar = kept(kept(shell, (middle - 0.2, 0, 0), (1, 0, 0)), (middle - 0.05, 0, 0), (-1, 0, 0))
         return [panes, foot, roof, pillar]
     tumble = 0.12 * z

@@ -82,7 +82,7 @@ def _base(p: Parameters, base: str, colours: Palette, floor: float, x: float, z:
         post = cylinder((0, 0.05, 0), (0, top, 0), 0.7 * width, colours.detail)
         return [*wheels, post, cylinder((0, 0.45 * floor, 0), (0, top, 0), 1.1 * width, ground)]
     if base == "sled":
-        inset = p.uniform("sled_inset", 0.0, 0.1)
+        inset = p.uniform("sled_inset", 0.0, 0.25) * x
         front, rear, side = x - inset, -x + inset, z - width / 2
         sides = window((rear, 0, side - width / 2), (front, top, side + width / 2), 2, width, ground)
         return pair(*sides[:3], sides[3])

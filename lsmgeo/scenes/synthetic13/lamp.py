@@ -106,7 +106,7 @@ def _shade(
         # A plate closes the shade near its top.
         level, reach = y + 0.8 * tall, radius * (0.2 + 0.8 * end) - 0.012
         plate = cylinder((x, level, z), (x, level + 0.03, z), reach, colours.trim)
-        return [tube(bottom, top, radius, end * radius, 0.035, colours.body), plate]
+        return [tube(bottom, top, radius, end * radius, min(0.035, 0.6 * end * radius), colours.body), plate]
     if shade == "stack":
         step = p.uniform("stack_step", 0.12, 0.26)
         sizes = [radius * (1 - step * k) for k in range(3)]

@@ -1,0 +1,288 @@
+"""The shapes of Synthetic-13: varied, upright, connected, and the same for everybody."""
+
+import importlib
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import label
+
+from lsmgeo import scenes
+from lsmgeo.cameras import CameraTensors
+from lsmgeo.errors import OptionError, ShapeError
+from lsmgeo.scenes import synthetic13
+from lsmgeo.scenes.synthetic13 import __main__ as program
+from lsmgeo.scenes.synthetic13.parameters import Parameters, random_palette
+
+CATEGORIES = tuple(synthetic13.CATEGORIES)
+
+
+@pytest.fixture(scope="module")
+def shapes():
+    return [synthetic13.shape(3, index) for index in range(20 * 13)]
+
+
+def materials(shape):
+    return [solid.material for solid in shape.scene.solids]
+
+
+def linear_parts(shape):
+    return np.stack([solid.world_from_local[:, :3] for solid in shape.scene.solids])
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_a_category_is_varied(category):
+    found = synthetic13.measure(category, count=24)
+    assert found.structures >= 6
+    assert found.fewest >= 8
+    assert 0 < found.iou <= 0.6
+
+
+def test_the_variety_is_what_it_says():
+    found = synthetic13.measure("sofa", count=5, size=16)
+    made = [synthetic13.shape(0, index, "sofa") for index in range(5)]
+    centers = (np.arange(16) + 0.5) / 16 - 0.5
+    points = torch.from_numpy(np.stack(np.meshgrid(centers, centers, centers, indexing="ij")[::-1], -1))
+    volumes = [scenes.occupancy([item.scene], points[None])[0].numpy() for item in made]
+    ratios = [
+        (volumes[i] & volumes[j]).sum() / (volumes[i] | volumes[j]).sum() for i in range(5) for j in range(i + 1, 5)
+    ]
+    np.testing.assert_allclose(found.iou, np.mean(ratios), rtol=1e-5)
+    np.testing.assert_allclose(found.fill, np.mean(volumes), rtol=1e-5)
+    assert found.structures == len({item.structure for item in made})
+    assert found.parts == np.mean([len(item.scene.solids) for item in made])
+
+
+def test_the_box_before_cuts_is_centred_with_a_diagonal_of_one(shapes):
+    for shape in shapes:
+        low, high = shape.scene.bounds()
+        np.testing.assert_allclose(low, -high, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(high - low), 1.0, rtol=1e-12)
+
+
+def test_no_part_is_thinner_than_a_fortieth(shapes):
+    least = min(2 * np.linalg.svd(linear_parts(shape), compute_uv=False).min() for shape in shapes)
+    assert least >= 1 / 40
+
+
+def test_shapes_are_cheap_to_render(shapes):
+    counts = [len(shape.scene.solids) for shape in shapes]
+    assert 8 <= np.mean(counts) <= 25
+    assert max(counts) <= 40
+    assert max(len(solid.cuts) for shape in shapes for solid in shape.scene.solids) <= 3
+
+
+def test_a_shape_is_one_body():
+    bodies, shares = [], []
+    for index in range(4 * 13):
+        volume = scenes.voxels([synthetic13.shape(1, index).scene], 64)[0].numpy()
+        pieces, count = label(volume, np.ones((3, 3, 3)))
+        bodies.append(count)
+        shares.append(np.bincount(pieces.ravel())[1:].max() / volume.sum())
+    assert np.mean(np.array(bodies) == 1) >= 0.96
+    assert min(shares) > 0.95
+
+
+def mean_x_of_the_top(shape):
+    """Where along x the highest quarter of the object lies."""
+    volume = scenes.voxels([shape.scene], 32)[0].numpy()  # (z, y, x)
+    _, y, x = np.nonzero(volume)
+    return (x[y >= y.max() - (y.max() - y.min()) / 4].mean() + 0.5) / 32 - 0.5
+
+
+def test_objects_stand_upright_and_face_x():
+    """The back of a chair or a sofa and the tail of an airplane are high, and behind."""
+    chairs = [synthetic13.shape(2, index, "chair") for index in range(12)]
+    sofas = [synthetic13.shape(2, index, "sofa") for index in range(24)]
+    planes = [synthetic13.shape(2, index, "airplane") for index in range(24)]
+    looked_at = [shape for shape in chairs if "back=none" not in shape.structure]
+    looked_at += [shape for shape in sofas if "plan=straight" in shape.structure and "arms=none" in shape.structure]
+    looked_at += [shape for shape in planes if "tail=T" in shape.structure and "kind=airliner" in shape.structure]
+    assert len(looked_at) > 10
+    for shape in looked_at:
+        assert mean_x_of_the_top(shape) < -0.05, shape.name
+
+
+def test_cars_stand_on_their_wheels():
+    for index in range(6):
+        shape = synthetic13.shape(2, index, "car")
+        low, _ = shape.scene.bounds()
+        dark = min(shape.scene.solids, key=lambda solid: solid.bounds()[0][1])
+        assert dark.kind is scenes.Kind.CYLINDER
+        # A wheel is round about z, and wheels are on both sides.
+        lower, upper = dark.bounds()
+        np.testing.assert_allclose(upper[0] - lower[0], upper[1] - lower[1], rtol=1e-9)
+        assert low[1] == pytest.approx(lower[1])
+
+
+def test_most_parts_have_one_colour_of_few(shapes):
+    plain = [material.texture == "plain" for shape in shapes for material in materials(shape)]
+    assert 0.8 <= np.mean(plain) < 1
+    assert all(len(set(materials(shape))) <= 4 for shape in shapes)
+    assert len({material.texture for shape in shapes for material in materials(shape)}) == 4
+
+
+def test_categories_take_turns(shapes):
+    assert [shape.category for shape in shapes[:26]] == [*CATEGORIES, *CATEGORIES]
+    assert len({shape.name for shape in shapes}) == len(shapes)
+    assert shapes[17].name == "chair-00000017"
+
+
+def test_the_synsets_and_the_two_halves():
+    assert synthetic13.CATEGORIES["airplane"] == "02691156"
+    assert synthetic13.CATEGORIES["vessel"] == "04530566"
+    assert len(set(synthetic13.CATEGORIES.values())) == 13
+    halves = synthetic13.CLASS_SPLITS["first"] + synthetic13.CLASS_SPLITS["second"]
+    assert sorted(halves) == sorted(CATEGORIES)
+
+
+def test_a_shape_depends_on_its_numbers_alone(shapes):
+    np.random.seed(1)  # noqa: NPY002  global state must not matter
+    torch.manual_seed(1)
+    for index in (200, 3, 57):
+        again, before = synthetic13.shape(3, index), shapes[index]
+        assert (again.structure, again.parameters, again.counts) == (
+            before.structure,
+            before.parameters,
+            before.counts,
+        )
+        np.testing.assert_array_equal(linear_parts(again), linear_parts(before))
+        assert materials(again) == materials(before)
+        for one, other in zip(again.lights, before.lights, strict=True):
+            torch.testing.assert_close(one, other, rtol=0, atol=0)
+    assert synthetic13.shape(4, 3).parameters != shapes[3].parameters
+    assert synthetic13.shape(3, 16).parameters != shapes[3].parameters
+
+
+def test_the_numbers_are_those_of_the_seeded_stream():
+    """The first draws of a chair, from numpy alone: a set made once can be made again."""
+    stream = np.random.Generator(np.random.PCG64(np.random.SeedSequence([5, 4, 0])))
+    chair = synthetic13.shape(5, 4)
+    picks = [int(stream.integers(7)), int(stream.integers(7))]
+    bases = ("four legs", "four legs", "splayed legs", "pedestal", "star", "sled", "side panels")
+    backs = ("solid", "vertical slats", "horizontal slats", "round", "solid", "frame", "none")
+    assert chair.structure[:2] == (f"base={bases[picks[0]]}", f"back={backs[picks[1]]}")
+    seats = 3 if backs[picks[1]] != "none" else 2
+    stream.integers(seats)
+    if backs[picks[1]] != "none":
+        stream.integers(3)
+    assert chair.parameters["seat_height"] == pytest.approx(0.3 + 0.45 * stream.random(), rel=1e-12)
+
+
+def test_a_category_can_be_asked_for():
+    shape = synthetic13.shape(0, 5, "lamp")
+    assert (shape.category, shape.name) == ("lamp", "lamp-00000005")
+
+
+def test_views_look_at_the_origin_from_all_around():
+    views = synthetic13.views(0, 7, 2000, 224)
+    assert views.cam_from_world.dtype == torch.float64
+    K, E = views.intrinsics.numpy(), views.cam_from_world.numpy()
+    np.testing.assert_allclose(K[0], [[420, 0, 111.5], [0, 420, 111.5], [0, 0, 1]])
+    centers = -np.einsum("nji,nj->ni", E[:, :3, :3], E[:, :3, 3])
+    np.testing.assert_allclose(np.linalg.norm(centers, axis=1), 2, rtol=1e-12)
+    np.testing.assert_allclose(E[:, :3, 3], np.tile([0, 0, 2], (2000, 1)), atol=1e-12)
+    elevation = np.degrees(np.arcsin(centers[:, 1] / 2))
+    azimuth = np.degrees(np.arctan2(centers[:, 2], centers[:, 0])) % 360
+    # Kolmogorov's distance from the uniform distributions; 2000 draws exceed 0.05 once in 10^4.
+    for angles, low, high in ((elevation, -20, 30), (azimuth, 0, 360)):
+        assert low <= angles.min() <= angles.max() <= high
+        expected = (np.sort(angles) - low) / (high - low)
+        assert np.abs(expected - (np.arange(2000) + 0.5) / 2000).max() < 0.05
+
+
+def test_the_first_views_do_not_depend_on_how_many():
+    few, many = synthetic13.views(1, 2, 3, 64), synthetic13.views(1, 2, 9, 64)
+    torch.testing.assert_close(many.cam_from_world[:3], few.cam_from_world, rtol=0, atol=0)
+    other = synthetic13.views(1, 3, 3, 64)
+    assert not torch.equal(other.cam_from_world, few.cam_from_world)
+
+
+def test_the_split_is_seventy_ten_twenty():
+    parts = [synthetic13.split(0, index) for index in range(5000)]
+    for name, share in (("train", 0.7), ("val", 0.1), ("test", 0.2)):
+        deviation = np.sqrt(share * (1 - share) / 5000)
+        assert abs(parts.count(name) / 5000 - share) < 4 * deviation
+    assert [synthetic13.split(1, index) for index in range(50)] != parts[:50]
+    # Within a category as well, though categories follow the index.
+    chairs = parts[4::13]
+    assert 0.6 < chairs.count("train") / len(chairs) < 0.8
+
+
+def test_lights_seldom_saturate_white():
+    generator = np.random.default_rng(0)
+    normals = generator.normal(size=(2000, 3))
+    normals = torch.from_numpy(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    clipped, counts = [], set()
+    for _ in range(100):
+        lights = synthetic13.random_lights(generator)
+        counts.add(len(lights.directions))
+        torch.testing.assert_close(lights.directions.norm(dim=-1), torch.ones(len(lights.directions)).double())
+        assert 0.28 <= lights.ambient.min() <= lights.ambient.max() <= 0.5
+        assert (lights.colours > 0).all()
+        facing = (normals @ lights.directions.T).clamp_min(0)
+        clipped.append(((lights.ambient + facing @ lights.colours) > 1).double().mean())
+    assert counts == {2, 3}
+    assert np.mean(clipped) < 0.03
+
+
+def test_shapes_render():
+    shape = synthetic13.shape(0, 4)
+    views = synthetic13.views(0, 4, 2, 48)
+    views = CameraTensors(*(torch.as_tensor(value)[None] for value in views))
+    picture = scenes.render([shape.scene], views, shape.lights)
+    covered = picture.mask.double().mean(dim=(-1, -2))
+    assert (covered > 0.02).all()
+    assert (covered < 0.9).all()
+    depth = picture.depth[picture.mask]
+    assert 1.4 < depth.min() < depth.max() < 2.6
+
+
+def test_a_parameter_has_one_name():
+    p = Parameters(np.random.default_rng(0))
+    p.uniform("height", 0, 1)
+    with pytest.raises(OptionError, match="'height' has been drawn already"):
+        p.choice("height", ("a", "b"))
+
+
+class Ends(Parameters):
+    """Draws every number from the two ends of its range: what fails anywhere fails there first."""
+
+    def uniform(self, name, low, high):
+        self.numbers[name] = low if super().uniform(name, low, high) < (low + high) / 2 else high
+        return self.numbers[name]
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_extreme_parameters_make_a_shape(category):
+    build = importlib.import_module(f"lsmgeo.scenes.synthetic13.{category}").build
+    generator = np.random.default_rng(0)
+    for _ in range(40):
+        parts = build(Ends(generator), random_palette(generator))
+        assert np.isfinite(scenes.Scene(parts).bounds()).all()
+
+
+@pytest.mark.parametrize("bad", [-1, 2**32, 1.0, True, "0"])
+def test_seeds_and_indices_are_checked(bad):
+    for call in (synthetic13.shape, synthetic13.split):
+        with pytest.raises(OptionError, match="seed must be an integer"):
+            call(bad, 0)
+        with pytest.raises(OptionError, match="index must be an integer"):
+            call(0, bad)
+
+
+def test_impossible_requests():
+    with pytest.raises(OptionError, match=r"category must be one of airplane, .*; got 'boat'"):
+        synthetic13.shape(0, 0, "boat")
+    with pytest.raises(ShapeError, match="count"):
+        synthetic13.views(0, 0, 0, 64)
+    with pytest.raises(ShapeError, match="at least 2"):
+        synthetic13.measure("chair", count=1)
+
+
+def test_the_table(capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["synthetic13", "2"])
+    program.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[2:]] == list(CATEGORIES)
+    assert all(0 <= float(line.split()[-1]) <= 1 for line in lines[2:])

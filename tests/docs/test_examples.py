@@ -47,3 +47,9 @@ def test_two_degrees_of_pose_noise_fall_below_a_fifth_of_a_degree(run):
 def test_a_tenth_of_the_faces_matters_little_to_the_vote(run):
     names = run("mesh_voxels")
     assert names["overlap"](names["before"], names["after"]) > 0.98
+
+
+def test_two_shapes_of_a_category_share_less_than_a_third(run):
+    names = run("synthetic13")
+    assert 0 < names["overlap"] < 1 / 3
+    assert max(names["found"], key=names["found"].get) == "car"

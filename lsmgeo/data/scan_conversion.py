@@ -24,7 +24,7 @@ __all__ = [
 ]
 
 # Largest number of (triangle, row) or (triangle, column) pairs held at once.
-CHUNK = 1 << 21
+CHUNK = 1 << 19
 # Less of a normal along an axis than this cannot carry a surface past the next voxel along another axis.
 SLOPE = 0.25
 

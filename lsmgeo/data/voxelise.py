@@ -84,7 +84,7 @@ def voxelise(
 
     Returns:
         (D, H, W) bool, axes z, y, x; centres as in `lsmgeo.VoxelGrid`. What is outside the grid is cut off. At 256^3
-        about 0.5 GB are needed beside the result.
+        about 0.6 GB are needed beside the result.
 
     Raises:
         DTypeError: not a `Mesh`, or arrays of other types.

@@ -149,7 +149,8 @@ class MeshFolder:
         picture = render_mesh(mesh, cameras, lights, shadows=recipe.shadows)
         if not picture.mask.any():
             raise DataError(self.root / file, "is seen in none of the views")
-        grids = [voxelise(mesh, resolution) for resolution in recipe.voxels]
+        # A lampshade or a sail has hardly a voxel whose centre it holds.
+        grids = [voxelise(mesh, resolution, keep_thin=True) for resolution in recipe.voxels]
         sample = Sample(
             images=picture.images,
             cameras=cameras,

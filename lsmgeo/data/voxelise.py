@@ -70,7 +70,7 @@ def voxelise(
     - "auto": each part connected through edges by what it is: closed parts by winding number, their faces made to
       agree and turned outwards first (unless they hollow out another part); closed parts that no turning makes agree
       by parity; parts with holes by vote; second copies of faces that make a part visible from both sides are left
-      out. With ``keep_thin``.
+      out.
 
     Args:
         mesh: (N, 3) vertices in world units and (F, 3) faces.
@@ -106,7 +106,9 @@ def voxelise(
     who = "voxelise"
     check_mesh(who, mesh)
     check_choice(who, "method", method, METHODS)
-    keep_thin = method == "auto" if keep_thin is None else check_flag(who, "keep_thin", keep_thin)
+    if keep_thin is None:
+        keep_thin = method == "auto" and not mesh.watertight
+    check_flag(who, "keep_thin", keep_thin)
     grid = VoxelGrid(resolution, lower, upper)
     depth, height, width = shape = tuple(grid.shape)  # type: ignore[arg-type]
     if max(shape) > LARGEST_RESOLUTION:

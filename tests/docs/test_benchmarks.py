@@ -8,7 +8,7 @@ import json
 import pytest
 import torch
 
-from benchmarks import compiled, contenders, gate, kernel, memory, report, timing
+from benchmarks import compiled, contenders, gate, kernel, loading, memory, report, scenes, timing
 from benchmarks.measure import timings
 from benchmarks.problems import LeftOut, Problem, Scene
 from benchmarks.settings import TINY, Settings
@@ -118,3 +118,22 @@ def test_results_that_are_kept_make_tables():
         cases = json.loads(path.read_text(encoding="utf-8"))["cases"]
         for rows in (report.time_rows(cases), report.goal_rows(cases), report.first_call_rows(cases)):
             assert {len(row) for row in rows} == {len(rows[0])}
+
+
+def test_rates_are_held_against_their_goals():
+    fast = {"case": "a", "rate": 61.7, "unit": "views/s", "slowest": 50.0, "fastest": 70.2, "target": 50.0}
+    slow = {"case": "b", "rate": 3.4, "unit": "shapes/s", "target": 4.0}
+    free = {"case": "c", "rate": 8.0, "unit": "views/s", "slowest": 7.0, "fastest": 9.0, "target": None}
+    assert report.rate_rows([fast, slow, free])[1:] == [
+        ["a", "62 views/s", "50 to 70", "50", "met"],
+        ["b", "3 shapes/s", "one run", "4", "**missed**"],
+        ["c", "8 views/s", "7 to 9", "—", ""],
+    ]
+
+
+def test_the_benchmarks_of_training_data_run(capsys):
+    scenes.main(["--quick"])
+    loading.main(["--quick"])
+    printed = capsys.readouterr().out
+    assert "lsmgeo render, 4 shapes of 2 views" in printed
+    assert "4 of 4 views, 64 x 64, no depth" in printed

@@ -44,6 +44,12 @@ def test_two_degrees_of_pose_noise_fall_below_a_fifth_of_a_degree(run):
     assert names["final"].max() < 0.2
 
 
+def test_pixels_of_an_analytic_ball_lie_on_it_to_rounding(run):
+    names = run("analytic_scene")
+    assert int(names["on_ball"].sum()) > 10_000
+    assert names["worst"] < 1e-14  # of the float64 pass, the last
+
+
 def test_a_tenth_of_the_faces_matters_little_to_the_vote(run):
     names = run("mesh_voxels")
     assert names["overlap"](names["before"], names["after"]) > 0.98

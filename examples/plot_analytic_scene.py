@@ -47,9 +47,8 @@ for dtype in (torch.float32, torch.float64):
     points = centers[0, 0] + directions[0, 0] * (exact.depth[0, 0].double() / (directions[0, 0] @ forward))[..., None]
     away = (points - torch.tensor([0.2, -0.02, 0.15], dtype=torch.float64)).norm(dim=-1) - 0.23
     on_ball = exact.mask[0, 0] & (away.abs() < 1e-3)
-    print(
-        f"{dtype}: {int(on_ball.sum())} pixels on the ball, farthest from its surface {away[on_ball].abs().max():.1e}"
-    )
+    worst = float(away[on_ball].abs().max())
+    print(f"{dtype}: {int(on_ball.sum())} pixels on the ball, at most {worst:.1e} from its surface")
 
 # %%
 # All of these come from one call. Occupancy, on the right, is asked for points: here those of an upright slice.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from math import prod
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 import torch
@@ -24,6 +24,7 @@ __all__ = [
     "check_mask",
     "check_number",
     "check_size",
+    "check_whole",
     "moved",
 ]
 
@@ -119,6 +120,17 @@ def check_number(who: str, name: str, value: Any, expected: str) -> float:
     if not isinstance(value, Real) or isinstance(value, bool) or not abs(float(value)) < float("inf"):
         raise OptionError(f"{who}: {name} must be {expected}; got {describe(value)}")
     return float(value)
+
+
+def check_whole(who: str, name: str, value: Any, least: int, most: int = 2**63 - 1) -> int:
+    """Require a whole number, Python's or numpy's, in a range; return Python's."""
+    is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if not is_whole or not least <= value <= most:
+        expected = (
+            f"a whole number, at least {least}" if most == 2**63 - 1 else f"a whole number from {least} to {most}"
+        )
+        raise OptionError(f"{who}: {name} must be {expected}; got {describe(value)}")
+    return int(value)
 
 
 def check_size(who: str, name: str, value: Any, length: int, expected: str) -> tuple[int, ...]:

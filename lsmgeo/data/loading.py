@@ -15,7 +15,7 @@ from typing import TypedDict
 import numpy as np
 from torch.utils.data import Dataset, Sampler
 
-from lsmgeo._checks import check_choice, check_flag, check_number, describe
+from lsmgeo._checks import check_choice, check_flag, check_number, check_whole, describe
 from lsmgeo.data.backgrounds import Background, make_background
 from lsmgeo.data.sample import Sample
 from lsmgeo.data.shard_reading import ShardSet
@@ -90,7 +90,7 @@ class ShapeDataset(Dataset[Sample]):
     ) -> None:
         self.shards = shards
         self.views = _view_range(views)
-        self.seed = _whole("seed", seed, 0)
+        self.seed = check_whole("ShapeDataset", "seed", seed, 0)
         self.depth = check_flag("ShapeDataset", "depth", depth)
         self.occupancy = occupancy
         self.background = make_background(background)
@@ -120,7 +120,7 @@ class ShapeDataset(Dataset[Sample]):
         Args:
             epoch: at least 0. Workers that run already do not hear of it: use `EpochSampler`.
         """
-        self.epoch = _whole("epoch", epoch, 0)
+        self.epoch = check_whole("ShapeDataset", "epoch", epoch, 0)
 
     def __getitem__(self, item: int | tuple[int, int]) -> Sample:
         epoch, index = item if isinstance(item, tuple | list) else (self.epoch, item)
@@ -128,7 +128,7 @@ class ShapeDataset(Dataset[Sample]):
             if isinstance(index, int | np.integer):  # what tells Python's own iteration where to stop
                 raise IndexError(f"ShapeDataset: index must be from 0 to {len(self) - 1}; got {index}")
             raise OptionError(f"ShapeDataset: an item is an index or (epoch, index); got {describe(item)}")
-        epoch, index = _whole("epoch", epoch, 0), int(index)
+        epoch, index = check_whole("ShapeDataset", "epoch", epoch, 0), int(index)
         try:
             return self._read(epoch, index, 0)
         except DataError as error:
@@ -238,9 +238,9 @@ class EpochSampler(Sampler[tuple[int, int]]):
         world_size: int = 1,
         shuffle: bool = True,
     ) -> None:
-        self.length = _whole("length", length, 1)
-        self.world_size = _whole("world_size", world_size, 1)
-        self.rank = _whole("rank", rank, 0)
+        self.length = check_whole("EpochSampler", "length", length, 1)
+        self.world_size = check_whole("EpochSampler", "world_size", world_size, 1)
+        self.rank = check_whole("EpochSampler", "rank", rank, 0)
         if self.rank >= self.world_size:
             raise OptionError(f"EpochSampler: rank must be below world_size = {world_size}; got {rank}")
         self.shuffle = check_flag("EpochSampler", "shuffle", shuffle)
@@ -253,7 +253,8 @@ class EpochSampler(Sampler[tuple[int, int]]):
             epoch: at least 0.
             position: samples of it that all ranks together have consumed.
         """
-        self.epoch, self.position = _whole("epoch", epoch, 0), _whole("position", position, 0)
+        self.epoch = check_whole("EpochSampler", "epoch", epoch, 0)
+        self.position = check_whole("EpochSampler", "position", position, 0)
 
     def state_dict(self) -> SamplerState:
         """Epoch, position and seed, as last set."""
@@ -265,7 +266,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
         Raises:
             OptionError: a value that is no whole number, at least 0.
         """
-        self.seed = _whole("seed", state["seed"], 0)
+        self.seed = check_whole("EpochSampler", "seed", state["seed"], 0)
         self.set_epoch(state["epoch"], state["position"])
 
     def order(self, epoch: int) -> np.ndarray:
@@ -277,7 +278,8 @@ class EpochSampler(Sampler[tuple[int, int]]):
         if not self.shuffle:
             return np.arange(self.length)
         # The sorting of uniform numbers is the same in all versions of numpy; its permutations need not be.
-        generator = np.random.default_rng(np.random.SeedSequence([self.seed, _whole("epoch", epoch, 0)]))
+        epoch = check_whole("EpochSampler", "epoch", epoch, 0)
+        generator = np.random.default_rng(np.random.SeedSequence([self.seed, epoch]))
         return np.argsort(generator.random(self.length), kind="stable")
 
     def __len__(self) -> int:
@@ -291,19 +293,13 @@ class EpochSampler(Sampler[tuple[int, int]]):
             yield epoch, index
 
 
-def _whole(name: str, value: int, least: int) -> int:
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or not least <= value < 2**63:
-        raise OptionError(f"{name} must be a whole number, at least {least}; got {describe(value)}")
-    return int(value)
-
-
 def _view_range(views: int | tuple[int, int] | None) -> tuple[int, int] | None:
     if views is None:
         return None
     pair = [views, views] if isinstance(views, int) else list(views) if isinstance(views, tuple | list) else []
     if len(pair) != 2:
         raise OptionError(f"ShapeDataset: views must be a number, (low, high) or None; got {describe(views)}")
-    low, high = (_whole("views", value, 1) for value in pair)
+    low, high = (check_whole("ShapeDataset", "views", value, 1) for value in pair)
     if low > high:
         raise OptionError(f"ShapeDataset: views must be (low, high), low <= high; got {describe(views)}")
     return low, high

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 
-from lsmgeo._checks import describe
+from lsmgeo._checks import check_whole, describe
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.cameras.tensors import check_cameras
 from lsmgeo.errors import DataError, LsmGeoError
@@ -108,15 +108,15 @@ def _metadata(values: Any, key: str) -> Metadata:
         raise ValueError("name must be a string; got null")
     seed, step, size = values["seed"], values["depth_step"], values["size"]
     if seed is not None:
-        seed = _whole("seed", seed, 0, 2**63 - 1)
+        seed = check_whole("metadata", "seed", seed, 0)
     if step is not None:
         if not isinstance(step, int | float) or isinstance(step, bool) or not 0 < step < 1e6:
             raise ValueError(f"depth_step must be a positive number below 1e6 or null; got {describe(step)}")
         step = float(step)
     if not isinstance(size, list) or len(size) != 2:
         raise ValueError(f"size must be [height, width]; got {describe(size)}")
-    height, width = (_whole("size", side, 1, MAX_SIDE) for side in size)
-    views = _whole("views", values["views"], 1, MAX_VIEWS)
+    height, width = (check_whole("size", "a side", side, 1, MAX_SIDE) for side in size)
+    views = check_whole("metadata", "views", values["views"], 1, MAX_VIEWS)
     voxels = values["voxels"]
     if not isinstance(voxels, list) or len(voxels) > MAX_VOXELS:
         raise ValueError(f"voxels must be a list of resolutions; got {describe(voxels)}")
@@ -128,7 +128,7 @@ def _metadata(values: Any, key: str) -> Metadata:
     sizes = (torch.full((views,), side) for side in (height, width))
     if not _are_plainly_cameras(K, E):
         check_cameras("cameras", CameraTensors(torch.from_numpy(K), torch.from_numpy(E), *sizes))
-    resolutions = tuple(_whole("voxels", side, 1, MAX_VOXELS) for side in voxels)
+    resolutions = tuple(check_whole("voxels", "a resolution", side, 1, MAX_VOXELS) for side in voxels)
     return Metadata(
         name=name,
         **texts,
@@ -139,12 +139,6 @@ def _metadata(values: Any, key: str) -> Metadata:
         cam_from_world=E,
         voxels=resolutions,
     )
-
-
-def _whole(field: str, value: Any, low: int, high: int) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-        raise ValueError(f"{field}: expected a whole number from {low} to {high}; got {describe(value)}")
-    return value
 
 
 def _matrices(field: str, rows: Any, views: int, side: int) -> np.ndarray:

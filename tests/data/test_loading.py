@@ -187,7 +187,7 @@ def test_another_number_of_ranks_goes_on_where_the_others_stopped():
      {"seed": 0, "length": 0}],
 )  # fmt: skip
 def test_what_is_no_order(options):
-    with pytest.raises(OptionError):
+    with pytest.raises(OptionError, match="EpochSampler: "):
         EpochSampler(**{"length": 10, **options})
 
 
@@ -220,7 +220,7 @@ def test_no_tar_is_read_to_choose(folder, monkeypatch):
         ({"views": (1, 2, 3)}, OptionError, "views must be a number"),
         ({"views": "4"}, OptionError, "views must be a number"),
         ({"views": VIEWS + 1}, DataError, r"set-000000.tar: shape-0 has 5 views; 6 are asked for"),
-        ({"seed": -1}, OptionError, "seed"),
+        ({"seed": -1}, OptionError, "ShapeDataset: seed must be a whole number, at least 0; got int -1"),
         ({"depth": None}, OptionError, "depth"),
         ({"background": "nowhere"}, DataError, "no folder of backgrounds"),
         ({"on_error": "ignore"}, OptionError, "on_error must be one of 'raise', 'skip'"),

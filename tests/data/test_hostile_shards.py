@@ -223,7 +223,7 @@ JSONS = {
     "no step": (lambda v: v.update(depth_step=None), "has no depth"),
     "a negative seed": (lambda v: v.update(seed=-1), "seed must be a whole number, at least 0"),
     "voxels of any kind": (lambda v: v.update(voxels=8), "voxels must be a list"),
-    "many voxels": (lambda v: v.update(voxels=[10**6]), "voxels: expected"),
+    "many voxels": (lambda v: v.update(voxels=[10**6]), "voxels: a resolution must be a whole number"),
     "other voxels": (lambda v: v.update(voxels=[32]), "no occupancy of int 8 voxels; it has 32"),
     "no cameras": (lambda v: v.pop("cameras"), "lacks 'cameras'"),
     "cameras of any kind": (lambda v: v.update(cameras=[]), "cameras must be an object"),

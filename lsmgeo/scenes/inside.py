@@ -20,6 +20,7 @@ POINTS_AT_ONCE = 1 << 15
 MARGIN = 1e-9
 
 
+@torch.no_grad()
 def occupancy(scenes: Sequence[Scene], points: Tensor) -> Tensor:
     """Whether points lie inside scenes: in a solid and in none of its cuts.
 
@@ -54,12 +55,12 @@ def occupancy(scenes: Sequence[Scene], points: Tensor) -> Tensor:
     return torch.stack(inside).view(points.shape[:-1])
 
 
-def voxels(scenes: Sequence[Scene], grid: VoxelGrid | int = 32) -> Tensor:
+def voxels(scenes: Sequence[Scene], grid: VoxelGrid | int | tuple[int, int, int] = 32) -> Tensor:
     """Whether the centres of a grid's voxels lie inside scenes.
 
     Args:
         scenes: S scenes.
-        grid: a `lsmgeo.VoxelGrid` without a batch, or n for n^3 voxels over [-0.5, 0.5]^3.
+        grid: a `lsmgeo.VoxelGrid` without a batch, or n or (D, H, W) for so many voxels over [-0.5, 0.5]^3.
 
     Returns:
         (S, D, H, W) bool.
@@ -74,7 +75,7 @@ def voxels(scenes: Sequence[Scene], grid: VoxelGrid | int = 32) -> Tensor:
         tensor(32)
     """
     scenes = check_scenes("voxels", scenes)
-    grid = VoxelGrid(grid) if isinstance(grid, int) else grid
+    grid = grid if isinstance(grid, VoxelGrid) else VoxelGrid(grid)
     if grid.world_from_grid is not None:
         centers = grid.centers()
         if centers.dim() != 4:

@@ -8,12 +8,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_devices, check_float, check_geometry, check_number, check_size, describe
+from lsmgeo._checks import check_devices, check_geometry, check_number, check_size
 from lsmgeo.cameras import as_tensors
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
 from lsmgeo.cameras.tensors import Cameras, check_cameras
 from lsmgeo.cameras.transforms import common_size
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
+from lsmgeo.scenes.inputs import behind, checked_lights
 from lsmgeo.scenes.lighting import Lights, shade
 from lsmgeo.scenes.surfaces import albedo, normals
 from lsmgeo.scenes.tables import Scene, check_scenes
@@ -21,8 +22,10 @@ from lsmgeo.scenes.tracing import CameraRays, FreeRays, Plan, first_hits, make_p
 
 __all__ = ["Hits", "Rendering", "render", "trace"]
 
-# Shadow rays leave a surface from this far above it, in world units.
-SHADOW_OFFSET = 1e-4
+# Shadow rays leave a surface from this far above it, as a fraction of its depth: scenes of any scale look alike.
+SHADOW_OFFSET = 5e-5
+# And from so many roundings of its coordinates, for surfaces far from the origin.
+SHADOW_ROUNDINGS = 16
 # Where views fit the caches, and solids are visited within windows; elsewhere many views go together.
 ONE_VIEW_AT_A_TIME = ("cpu",)
 VIEWS_AT_ONCE = 64
@@ -46,6 +49,7 @@ class Hits(NamedTuple):
     hit: Tensor  # (S, N) bool
 
 
+@torch.no_grad()
 def render(
     scenes: Sequence[Scene],
     cameras: Cameras,
@@ -104,14 +108,16 @@ def render(
             f"{who}: cameras must have the leading shape (S, V) with S = {len(scenes)} scenes; "
             f"got {tuple(tensors.intrinsics.shape[:-2])}"
         )
+    if tensors.intrinsics.shape[1] == 0:
+        raise ShapeError(f"{who}: cameras must have one view at least; got V = 0")
     check_cameras(who, tensors)
     size = common_size(who, tensors) if size is None else check_size(who, "size", size, 2, "(h, w)")  # type: ignore[assignment]
     assert size is not None
     count, per_scene = tensors.intrinsics.shape[:2]
     device = tensors.intrinsics.device
     matrices = CameraMatrices(*(value.flatten(0, 1) for value in camera_matrices(tensors, size)))
-    lights = _lights(who, lights, count, device, dtype)
-    images = _background(who, background, (count, per_scene, 3, *size), device, dtype)
+    lights = checked_lights(who, lights, count, device, dtype)
+    images = behind(who, background, (count, per_scene, 3, *size), device, dtype)
     depth = images.new_zeros((count, per_scene, *size))
     normal = torch.zeros_like(images)
     mask = torch.zeros_like(depth, dtype=torch.bool)
@@ -138,11 +144,18 @@ def _blocks(count: int, views: int, device: torch.device) -> Iterator[tuple[slic
         for scene in range(count):
             yield slice(scene, scene + 1), [0], [slice(v, v + 1) for v in range(scene * views, (scene + 1) * views)]
         return
-    step = max(1, VIEWS_AT_ONCE // max(views, 1))
+    if views > VIEWS_AT_ONCE:
+        for scene in range(count):
+            starts = range(scene * views, (scene + 1) * views, VIEWS_AT_ONCE)
+            for start in starts:
+                block = slice(start, min(start + VIEWS_AT_ONCE, starts.stop))
+                yield slice(scene, scene + 1), [0] * (block.stop - block.start), [block]
+        return
+    step = VIEWS_AT_ONCE // views
     for first in range(0, count, step):
         last = min(first + step, count)
         owner = [scene for scene in range(last - first) for _ in range(views)]
-        yield slice(first, last), owner, [slice(first * views, last * views)] if views else []
+        yield slice(first, last), owner, [slice(first * views, last * views)]
 
 
 def _render_views(
@@ -176,8 +189,9 @@ def _render_views(
     normal = normals(solids, rows, points)
     light = Lights(*(each(value[owner]) for value in lights))
     lit = None
-    if shadows:
-        start = points + SHADOW_OFFSET * normal
+    if shadows and lights.directions.shape[1]:
+        rounding = SHADOW_ROUNDINGS * torch.finfo(dtype).eps * points.abs().amax(0)
+        start = points + (SHADOW_OFFSET * depth + rounding) * normal
         lit = _lit(plan._replace(tables=solids), owner, start, at, shape, lights)
     _put(out.images, at, shade(albedo(solids, rows, points).T, normal.T, light, lit).T)
     _put(out.normals, at, normal)
@@ -213,6 +227,7 @@ def _lit(
     return torch.stack(columns, -1)
 
 
+@torch.no_grad()
 def trace(scenes: Sequence[Scene], origins: Tensor, directions: Tensor, *, near: float = 1e-6) -> Hits:
     """Where rays first enter a solid, in closed form.
 
@@ -266,39 +281,3 @@ def _positive(who: str, name: str, value: float) -> float:
     if not number > 0:
         raise OptionError(f"{who}: {name} must be a positive number; got {value!r}")
     return number
-
-
-def _lights(who: str, lights: Lights, count: int, device: torch.device, dtype: torch.dtype) -> Lights:
-    """The lights with a leading axis of scenes, on the device that renders."""
-    if not isinstance(lights, Lights):
-        raise DTypeError(f"{who}: lights must be Lights; got {describe(lights)}")
-    whole = []
-    for name, value, rank in zip(lights._fields, lights, (3, 3, 2), strict=True):
-        check_float(who, f"lights.{name}", value, "(S, L, 3), ambient (S, 3)")
-        value = value.expand(count, *value.shape) if value.dim() == rank - 1 else value
-        if value.dim() != rank or value.shape[0] != count or value.shape[-1] != 3:
-            raise ShapeError(
-                f"{who}: lights.{name} must be {'(S, L, 3)' if rank == 3 else '(S, 3)'} with S = {count} scenes, or "
-                f"without S; got {tuple(value.shape)}"
-            )
-        whole.append(value.to(device, dtype))
-    if whole[0].shape != whole[1].shape:
-        raise ShapeError(
-            f"{who}: lights.directions and lights.colours must agree; got {tuple(whole[0].shape)} and "
-            f"{tuple(whole[1].shape)}"
-        )
-    return Lights(*whole)
-
-
-def _background(
-    who: str, value: Tensor | Sequence[float], shape: tuple[int, ...], device: torch.device, dtype: torch.dtype
-) -> Tensor:
-    """A new array of the images' shape that holds what is behind the surfaces."""
-    try:
-        colour = torch.as_tensor(value, device=device, dtype=dtype)
-        colour = colour[:, None, None] if colour.dim() == 1 else colour
-        return colour.expand(shape).contiguous().clone() if colour.shape != shape else colour.clone()
-    except (RuntimeError, TypeError, ValueError) as error:
-        raise ShapeError(
-            f"{who}: background must be RGB (3,) or broadcast to (S, V, 3, H, W) = {shape}; got {describe(value)}"
-        ) from error

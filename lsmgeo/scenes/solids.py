@@ -49,11 +49,19 @@ class Material:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        for name in ("colour", "second"):
+            colour = getattr(self, name)
+            try:
+                values = tuple(float(value) for value in colour)
+            except (TypeError, ValueError):
+                values = ()
+            if len(values) != 3 or not all(0 <= value <= 1 for value in values):
+                raise OptionError(f"Material: {name} must be three numbers in [0, 1]; got {colour!r:.80}")
+            object.__setattr__(self, name, values)
+        if not isinstance(self.seed, int | np.integer) or isinstance(self.seed, bool) or self.seed < 0:
+            raise OptionError(f"Material: seed must be a whole number, 0 at least; got {self.seed!r:.80}")
         if self.texture not in TEXTURES:
             raise OptionError(f"Material: texture must be one of {', '.join(TEXTURES)}; got {self.texture!r}")
-        for name, colour in (("colour", self.colour), ("second", self.second)):
-            if len(colour) != 3 or not all(0 <= value <= 1 for value in colour):
-                raise OptionError(f"Material: {name} must be three numbers in [0, 1]; got {colour!r}")
         if not 0 < self.frequency < float("inf"):
             raise OptionError(f"Material: frequency must be positive and finite; got {self.frequency!r}")
 
@@ -80,7 +88,8 @@ class Solid:
         matrix = np.array(self.world_from_local, dtype=np.float64)
         if matrix.shape != (3, 4) or not np.isfinite(matrix).all():
             raise OptionError(f"Solid: world_from_local must be a finite (3, 4) matrix; got {matrix.shape}")
-        if not abs(np.linalg.det(matrix[:, :3])) > 1e-18:
+        sizes = np.linalg.norm(matrix[:, :3], axis=0)
+        if not abs(np.linalg.det(matrix[:, :3])) > 1e-12 * sizes.prod() > 0:
             raise OptionError("Solid: world_from_local must be invertible; a size is zero")
         if not 0 <= self.taper <= 1:
             raise OptionError(f"Solid: taper must be in [0, 1]; got {self.taper!r}")
@@ -91,7 +100,10 @@ class Solid:
 
     def transformed(self, matrix: Vector) -> Solid:
         """The solid, with its cuts, moved by an affine (3, 4) or (4, 4) matrix."""
-        matrix = np.asarray(matrix, dtype=np.float64)[:3]
+        matrix = np.asarray(matrix, dtype=np.float64)
+        if matrix.shape not in ((3, 4), (4, 4)):
+            raise OptionError(f"transformed: matrix must be affine, (3, 4) or (4, 4); got {matrix.shape}")
+        matrix = matrix[:3]
         linear = matrix[:, :3] @ self.world_from_local
         linear[:, 3] += matrix[:, 3]
         return replace(self, world_from_local=linear, cuts=tuple(cut.transformed(matrix) for cut in self.cuts))

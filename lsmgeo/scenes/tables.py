@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -98,11 +98,14 @@ def check_scenes(who: str, scenes: Sequence[Scene]) -> tuple[Scene, ...]:
         OptionError: not a sequence of `Scene`.
         ShapeError: no scene.
     """
-    if isinstance(scenes, Scene) or not all(isinstance(scene, Scene) for scene in scenes):
+    if isinstance(scenes, Scene) or not isinstance(scenes, Iterable):
+        raise OptionError(f"{who}: scenes must be a sequence of Scene; got {scenes!r:.80}")
+    scenes = tuple(scenes)
+    if not all(isinstance(scene, Scene) for scene in scenes):
         raise OptionError(f"{who}: scenes must be a sequence of Scene; got {scenes!r:.80}")
     if not scenes:
         raise ShapeError(f"{who}: scenes must hold one Scene at least; got none")
-    return tuple(scenes)
+    return scenes
 
 
 # Of canonical solids: low, high, round, radius; a cone's radius and slope follow from its taper.

@@ -23,6 +23,8 @@ __all__ = ["CameraRays", "FreeRays", "Plan", "first_hits", "make_plan"]
 
 Window = tuple[slice, slice]
 EVERYTHING = (slice(None), slice(None))
+# Surfaces nearer to each other than so many roundings of the ray parameter are taken to coincide, at cuts.
+ROUNDINGS = 16
 
 
 class Visit(NamedTuple):
@@ -245,26 +247,31 @@ def _enter(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Start and end of the rays' first stretch inside solids less their cuts, and the row whose surface begins it."""
 
-    def intervals(kind: Kind, rows: list[int], views: list[int]) -> tuple[Tensor, Tensor]:
+    def intervals(kind: Kind, rows: list[int], views: list[int]) -> tuple[Tensor, Tensor, Tensor]:
         point, direction, at = rays.local(rows, views, window)
         taper = solids.taper[rows, None, None].to(dtype) if kind is Kind.CONE else 1.0
         start, end = interval(kind, point, direction, taper)
-        return start + at, end + at
+        return start + at, end + at, at
 
-    start, end = intervals(visit.kind, visit.rows, visit.views)
+    start, end, at = intervals(visit.kind, visit.rows, visit.views)
     who = torch.tensor(visit.rows, dtype=torch.int32, device=start.device)[:, None, None]
     if not visit.cuts:
         return start, end, who
     start = start.clamp_min(near)
     who = who.expand(start.shape).clone()
+    # Faces that are meant to coincide, of a cut and its solid or of two cuts, differ by rounding: no sliver is left.
+    rounding = ROUNDINGS * torch.finfo(dtype).eps
     gone = []
     for kind, which, rows in visit.cuts:
         row = torch.tensor(rows, dtype=torch.int32, device=start.device)[:, None, None]
-        gone.append((which, row, *intervals(kind, rows, [visit.views[member] for member in which])))
+        from_here, to_here, there = intervals(kind, rows, [visit.views[member] for member in which])
+        gone.append((which, row, from_here, to_here, there.abs()))
     # A cut may lead into another: as many rounds as there are cuts settle it.
     for _ in gone:
-        for which, row, from_here, to_here in gone:
-            inside = (from_here <= start[which]) & (start[which] < to_here)
-            start[which] = torch.where(inside, to_here, start[which])
+        for which, row, from_here, to_here, there in gone:
+            begin = start[which]
+            inside = (from_here - rounding * (begin.abs() + there) <= begin) & (begin < to_here)
+            start[which] = torch.where(inside, to_here, begin)
             who[which] = torch.where(inside, row, who[which])
-    return start, end, who
+    from_cut = who != who.new_tensor(visit.rows)[:, None, None]
+    return start, torch.where(from_cut, end - rounding * (start.abs() + at.abs()), end), who

@@ -10,11 +10,12 @@ import torch
 
 from lsmgeo import scenes
 from lsmgeo.cameras import CameraTensors, orbit
-from lsmgeo.errors import DTypeError, OptionError, ShapeError
+from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
 
 AXES = np.eye(3)
 VIEW = orbit(torch.zeros(1, 1), 0.0, 2.0, focal_length=20.0, height=9, width=9)
 SUN = scenes.Lights(torch.tensor([[1.0, 0.0, 0.0]]), torch.full((1, 3), 0.6), torch.full((3,), 0.3))
+NO_VIEW = CameraTensors(torch.zeros(1, 0, 3, 3), torch.zeros(1, 0, 4, 4), 9, 9)
 BALL = scenes.Scene([scenes.sphere((0, 0, 0), 0.4)])
 
 
@@ -48,6 +49,12 @@ def test_a_cut_takes_away_from_its_own_solid_alone():
     assert inside(drilled, (0, 0, 0), (0, 0.3, 0)) == [False, True]
     both = scenes.Scene([drilled, whole])
     assert scenes.occupancy([both], torch.tensor([[[0.0, 0, 0], [0.3, 0, 0]]]))[0].tolist() == [True, False]
+
+
+def test_solids_may_be_tiny_and_colours_lists():
+    assert inside(scenes.sphere((0, 0, 0), 1e-9), (0, 0, 5e-10), (0, 0, 2e-9)) == [True, False]
+    assert inside(scenes.box((0, 0, 0), (1e-3, 1e-3, 1e-9)), (0, 0, 4e-10), (0, 0, 6e-10)) == [True, False]
+    assert scenes.Material(np.array([0.1, 0.2, 0.3])) == scenes.Material((0.1, 0.2, 0.3))
 
 
 def test_moves_compose_as_matrices():
@@ -116,6 +123,13 @@ def test_backgrounds_lie_behind():
     assert outside.any()
     torch.testing.assert_close(found.images[0, 0][:, outside], picture[:, outside])
     assert not torch.isclose(found.images[0, 0][:, ~outside], picture[:, ~outside]).all()
+    # Of any layout in memory.
+    turned = picture.permute(1, 2, 0).contiguous().permute(2, 0, 1).expand(1, 1, 3, 9, 9)
+    torch.testing.assert_close(scenes.render([BALL], VIEW, SUN, background=turned).images, found.images)
+    views = orbit(torch.zeros(2, 3), 0.0, 2.0, focal_length=20.0, height=9, width=9)
+    swapped = torch.zeros(3, 2, 3, 9, 9).transpose(0, 1)
+    both = scenes.render([BALL, BALL], views, SUN, background=swapped)
+    torch.testing.assert_close(both.images[1, 2][:, ~outside], found.images[0, 0][:, ~outside])
 
 
 def test_batches_are_loops():
@@ -159,6 +173,9 @@ def test_another_size_sees_the_same():
         (lambda: scenes.Material(texture="marble"), "plain, stripes, checker, waves"),
         (lambda: scenes.Material((1, 2, 0)), r"three numbers in \[0, 1\]"),
         (lambda: scenes.Material(frequency=0), "frequency must be positive"),
+        (lambda: scenes.Material("red"), "three numbers"),
+        (lambda: scenes.Material(seed=-1), "seed must be a whole number"),
+        (lambda: BALL.transformed(np.eye(3)), "must be affine"),
         (lambda: scenes.Scene([]), "one at least"),
         (lambda: scenes.Scene(["ball"]), "must be Solids"),
         (lambda: BALL.solids[0].minus(BALL.solids[0].minus(BALL.solids[0])), "no cuts of its own"),
@@ -174,6 +191,8 @@ def test_impossible_scenes_are_refused(make, words):
     [
         (lambda: scenes.render(BALL, VIEW, SUN), OptionError, "sequence of Scene"),
         (lambda: scenes.render([], VIEW, SUN), ShapeError, "one Scene at least"),
+        (lambda: scenes.render(None, VIEW, SUN), OptionError, "sequence of Scene"),
+        (lambda: scenes.render([BALL], NO_VIEW, SUN), ShapeError, "V = 0"),
         (lambda: scenes.render([BALL, BALL], VIEW, SUN), ShapeError, "S = 2 scenes"),
         (lambda: scenes.render([BALL], VIEW, SUN, dtype=torch.float16), DTypeError, "float32 or torch.float64"),
         (lambda: scenes.render([BALL], VIEW, "sun"), DTypeError, "must be Lights"),
@@ -185,6 +204,7 @@ def test_impossible_scenes_are_refused(make, words):
         (lambda: scenes.trace([BALL], torch.zeros(1, 4, 3), torch.zeros(1, 5, 3)), ShapeError, "must agree"),
         (lambda: scenes.occupancy([BALL], torch.zeros(3, 4, 3)), ShapeError, "S = 1 scenes"),
         (lambda: scenes.voxels([BALL], 0), ValueError, "at least"),
+        (lambda: scenes.voxels([BALL], "many"), GridError, "shape must be"),
     ],
 )
 def test_bad_arguments_are_named(call, error, words):

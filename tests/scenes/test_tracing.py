@@ -201,3 +201,75 @@ def test_voxels_agree_with_the_oracle(wanted, turned):
     found = scenes.voxels([wanted.scene], grid)
     np.testing.assert_array_equal(found[0].flatten().numpy(), truth.holds(wanted.parts, points))
     assert found.shape == (1, 5, 6, 7)
+
+
+def test_a_cut_flush_with_a_face_opens_it():
+    """A drawer: no lid of rounding remains, wherever the camera is; nor a wall between cuts that touch."""
+    drawer = scenes.box((0.1, 0, 0.05), (1, 0.5, 1)).minus(scenes.box((0.1, 0.05, 0.05), (0.8, 0.4, 0.8)))
+    halves = scenes.box((0.1, 0, 0.05), (1, 0.5, 1)).minus(
+        scenes.box((-0.1, 0.05, 0.05), (0.4, 0.4, 0.8)), scenes.box((0.3, 0.05, 0.05), (0.4, 0.4, 0.8))
+    )
+    views = orbit(torch.tensor([[10.0, 75.0, 200.0]]), 50.0, 3.0, focal_length=120.0, height=90, width=110)
+    floor = []
+    for solid in (drawer, drawer.rotated(0, 17.0), halves):
+        found = scenes.render([scenes.Scene([solid])], views, SUN)
+        centers = -(views.cam_from_world[0, :, :3, :3].mT @ views.cam_from_world[0, :, :3, 3:])[..., 0]
+        through = views.cam_from_world[0, :, :3, :3].mT @ torch.linalg.inv(views.intrinsics[0])
+        v, u = torch.meshgrid(torch.arange(90.0), torch.arange(110.0), indexing="ij")
+        rays = torch.einsum("vij,hwj->vhwi", through, torch.stack((u, v, torch.ones_like(u)), -1))
+        points = centers[:, None, None] + found.depth[0, ..., None] * rays
+        matrix = torch.from_numpy(np.linalg.inv(np.r_[solid.world_from_local, [[0, 0, 0, 1]]])).float()
+        local = points @ matrix[:3, :3].T + matrix[:3, 3]
+        opening = found.mask[0] & (local[..., 0].abs() < 0.79) & (local[..., 2].abs() < 0.79)
+        assert opening.sum() > 500
+        assert not (opening & (local[..., 1] > 0.99)).any()
+        floor.append(int((opening & (local[..., 1] < -0.5)).sum()))
+    assert floor[0] == floor[2]
+
+
+def test_a_hole_through_flush_at_both_ends_is_seen_through():
+    plate = scenes.box((0, 0.1, 0), (1, 0.2, 1)).minus(scenes.box((0, 0.1, 0), (0.5, 0.2, 0.5)))
+    view = orbit(torch.tensor([[30.0]]), 85.0, 3.0, focal_length=120.0, height=61, width=61, target=(0.0, 0.1, 0.0))
+    found = scenes.render([scenes.Scene([plate])], view, SUN)
+    assert not found.mask[0, 0, 26:35, 26:35].any()
+    assert found.mask.any()
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e-2, 1.0, 1e3])
+def test_shadows_are_the_same_at_every_scale(scale):
+    solids = [
+        scenes.sphere((0, 0.3, 0), 0.2),
+        scenes.half_space((0, 0, 0), (0, 1, 0)),
+        scenes.box((0.3, 0.1, 0), (0.2, 0.2, 0.2)),
+    ]
+    views = orbit(torch.tensor([[20.0]]), 35.0, 2.0 * scale, focal_length=60.0, height=60, width=60)
+    scene = scenes.Scene([solid.scaled(scale) for solid in solids])
+    light = scenes.Lights(torch.tensor([[0.48, 0.8, 0.36]]), torch.full((1, 3), 0.6), torch.full((3,), 0.2))
+    found = scenes.render([scene], views, light, shadows=True, near=1e-6 * scale).images
+    unit = orbit(torch.tensor([[20.0]]), 35.0, 2.0, focal_length=60.0, height=60, width=60)
+    expected = scenes.render([scenes.Scene(solids)], unit, light, shadows=True, dtype=torch.float64).images
+    different = ~torch.isclose(found.double(), expected, atol=1e-3).all(2)
+    assert int(different.sum()) <= 6  # at the shadows' edges
+    blocked = torch.isclose(expected, torch.tensor(0.14, dtype=torch.float64), atol=1e-4).all(2)
+    assert int(blocked.sum()) > 100
+
+
+def test_many_views_of_a_scene_are_split(monkeypatch):
+    monkeypatch.setattr(rendering, "ONE_VIEW_AT_A_TIME", ())
+    monkeypatch.setattr(rendering, "VIEWS_AT_ONCE", 2)
+    solids = [scenes.Scene([scenes.sphere((x, 0, 0), 0.2)]) for x in (0.0, 0.1)]
+    views = orbit(torch.arange(10.0).view(2, 5) * 30, 10.0, 2.0, focal_length=20.0, height=9, width=9)
+    together = scenes.render(solids, views, SUN)
+    monkeypatch.undo()
+    torch.testing.assert_close(together.depth, scenes.render(solids, views, SUN).depth)
+
+
+def test_nothing_is_recorded_for_derivatives():
+    view = orbit(torch.zeros(1, 1), 0.0, 2.0, focal_length=20.0, height=9, width=9)
+    view = view._replace(cam_from_world=view.cam_from_world.requires_grad_())
+    lights = SUN._replace(ambient=torch.full((3,), 0.3, requires_grad=True))
+    scene = scenes.Scene([scenes.sphere((0, 0, 0), 0.3)])
+    found = scenes.render([scene], view, lights, background=torch.ones(3, requires_grad=True))
+    assert not any(value.requires_grad for value in found)
+    dark = scenes.Lights(torch.zeros(0, 3), torch.zeros(0, 3), torch.ones(3))
+    assert float(scenes.render([scene], view, dark, shadows=True).images[0, 0, 0, 4, 4]) == pytest.approx(0.7)

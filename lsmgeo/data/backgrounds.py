@@ -14,9 +14,13 @@ from lsmgeo._checks import check_number, describe
 from lsmgeo.data.files import child, read_image
 from lsmgeo.errors import DataError, OptionError
 
-__all__ = ["Background", "BackgroundSource", "make_background"]
+__all__ = ["Background", "BackgroundError", "BackgroundSource", "make_background"]
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+class BackgroundError(DataError):
+    """A background cannot be had, which is no fault of the shape before it."""
 
 
 class BackgroundSource(Protocol):

@@ -16,7 +16,7 @@ import numpy as np
 from torch.utils.data import Dataset, Sampler
 
 from lsmgeo._checks import check_choice, check_flag, check_number, check_whole, describe
-from lsmgeo.data.backgrounds import Background, make_background
+from lsmgeo.data.backgrounds import Background, BackgroundError, make_background
 from lsmgeo.data.sample import Sample
 from lsmgeo.data.shard_reading import ShardSet
 from lsmgeo.errors import DataError, OptionError
@@ -37,7 +37,8 @@ class ShapeDataset(Dataset[Sample]):
     with its text). With ``on_error="skip"`` another shape stands in for it, drawn by a hash of seed, epoch and index;
     a line goes to `bad_samples`, and where more than `max_bad_fraction` of the data set is bad, the error is raised
     after all. Each process counts the different bad shapes that it met itself: with W workers the limit may be passed
-    up to W times over before one of them stops.
+    up to W times over before one of them stops. A picture of the folder of backgrounds that cannot be used is no fault
+    of a shape and raises in any case.
 
     Args:
         shards: the shapes.
@@ -96,6 +97,8 @@ class ShapeDataset(Dataset[Sample]):
         self.background = make_background(background)
         self.on_error = check_choice("ShapeDataset", "on_error", on_error, ("raise", "skip"))
         self.max_bad_fraction = check_number("ShapeDataset", "max_bad_fraction", max_bad_fraction, "a share in [0, 1]")
+        if not 0 <= self.max_bad_fraction <= 1:
+            raise OptionError(f"ShapeDataset: max_bad_fraction must be a share in [0, 1]; got {max_bad_fraction!r}")
         self.bad_samples = Path(bad_samples if bad_samples is not None else shards.folder / "bad_samples.jsonl")
         self.epoch = 0
         self.indices = _filtered(shards, categories, split)
@@ -123,7 +126,10 @@ class ShapeDataset(Dataset[Sample]):
         self.epoch = check_whole("ShapeDataset", "epoch", epoch, 0)
 
     def __getitem__(self, item: int | tuple[int, int]) -> Sample:
-        epoch, index = item if isinstance(item, tuple | list) else (self.epoch, item)
+        pair = item if isinstance(item, tuple | list) else (self.epoch, item)
+        if len(pair) != 2:
+            raise OptionError(f"ShapeDataset: an item is an index or (epoch, index); got {describe(item)}")
+        epoch, index = pair
         if not isinstance(index, int | np.integer) or isinstance(index, bool) or not 0 <= index < len(self):
             if isinstance(index, int | np.integer):  # what tells Python's own iteration where to stop
                 raise IndexError(f"ShapeDataset: index must be from 0 to {len(self) - 1}; got {index}")
@@ -132,7 +138,7 @@ class ShapeDataset(Dataset[Sample]):
         try:
             return self._read(epoch, index, 0)
         except DataError as error:
-            if self.on_error == "raise":
+            if self.on_error == "raise" or isinstance(error, BackgroundError):
                 raise
             self._report(epoch, index, error)
         for attempt in range(1, SUBSTITUTES + 1):
@@ -142,6 +148,8 @@ class ShapeDataset(Dataset[Sample]):
                 continue
             try:
                 return self._read(epoch, substitute, attempt)
+            except BackgroundError:
+                raise
             except DataError as error:
                 self._report(epoch, substitute, error)
         raise DataError(

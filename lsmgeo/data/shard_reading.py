@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from lsmgeo._checks import check_flag, describe
-from lsmgeo.data.backgrounds import Background, make_background
+from lsmgeo.data.backgrounds import Background, BackgroundError, make_background
 from lsmgeo.data.files import child
 from lsmgeo.data.members import decode_depth, decode_occupancy, decode_picture
 from lsmgeo.data.metadata import Metadata, decode_metadata
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 __all__ = ["ShardSet"]
 
 OPEN_FILES = 128
+# Of all pictures of one call. Flat pictures pack a thousandfold: small tars may hold more than any memory does.
+MAX_PIXELS_AT_ONCE = 1 << 28
 
 
 class ShardSet:
@@ -148,7 +150,8 @@ class ShardSet:
 
         Raises:
             OptionError: no such shape or view, or an option that is none.
-            DataError: what is asked for is not in the shard, or it is damaged.
+            DataError: what is asked for is not in the shard, it is damaged, it is more than 2^28 pixels at once (views
+                times height times width), or a picture of the folder of backgrounds cannot be used.
         """
         number, row = self._locate(index)
         metadata = self.metadata(index)
@@ -156,12 +159,23 @@ class ShardSet:
         if source.is_random and generator is None:
             raise OptionError("ShardSet.read: a random background needs a generator")
         chosen = _views(views, int(self.view_counts[index]))
+        height, width = metadata.size
+        if len(chosen) * height * width > MAX_PIXELS_AT_ONCE:
+            raise DataError(
+                self._shards[number].path,
+                f"{self._shards[number].keys[row]}: {len(chosen)} views of {height} x {width} are more than the "
+                f"{MAX_PIXELS_AT_ONCE} pixels that are read at once; read fewer views",
+            )
         # All are read before anything of their size is made: what a damaged json claims is made by nobody.
         pictures = [self._picture(number, row, view, metadata) for view in chosen]
         images = np.empty((len(chosen), 3, *metadata.size), np.float32)
         masks = np.empty((len(chosen), *metadata.size), np.bool_)
         for image, mask, picture in zip(images, masks, pictures, strict=True):
-            _composite(image, mask, picture, source(generator, *metadata.size))
+            try:
+                behind = source(generator, height, width)
+            except DataError as error:
+                raise BackgroundError(error.path, error.reason) from error
+            _composite(image, mask, picture, behind)
         depths = self._depth(number, row, chosen, metadata) if check_flag("ShardSet.read", "depth", depth) else None
         grid = None if occupancy is None else self._occupancy(number, row, occupancy, metadata)
         return Sample(

@@ -11,7 +11,7 @@ import zlib
 import numpy as np
 import pytest
 
-from lsmgeo.data import ShardSet
+from lsmgeo.data import ShardSet, shard_reading
 from lsmgeo.errors import DataError
 from tests.data.hostile import SIDECAR, TAR, judged, mutated, read_all, refused, rewritten
 from tests.data.shapes import write_set
@@ -137,6 +137,32 @@ def test_links_and_pipes(folder, tmp_path_factory, name):
     (folder / name).unlink()
     (folder / name).mkdir()
     refused(folder, "no such file", name)
+
+
+def test_pictures_that_are_too_many_at_once(tmp_path, monkeypatch):
+    """What a small file claims is neither read nor made; all that is asked for counts together."""
+    write_set(tmp_path, shards=1, each=1, views=2)
+
+    def enlarged(members):
+        values = json.loads(members["00000000.json"])
+        values["size"], values["views"] = [4096, 4096], 17
+        values["cameras"] = {name: 9 * matrices[:1] + 8 * matrices[1:] for name, matrices in values["cameras"].items()}
+        members["00000000.json"] = json.dumps(values).encode()
+        for view in range(2, 17):
+            members[f"00000000.{view:02d}.png"] = members["00000000.00.png"]
+
+    rewritten(tmp_path, enlarged)
+    shards = ShardSet(tmp_path)
+    with pytest.raises(DataError, match=r"00000000: 17 views of 4096 x 4096 are more than .* read fewer views"):
+        shards.read(0)
+    with pytest.raises(DataError, match=r"is 16 x 12 pixels .* expected 4096 x 4096"):
+        shards.read(0, views=range(16))
+    folder = tmp_path / "small"
+    write_set(folder, shards=1, each=1, views=2)
+    monkeypatch.setattr(shard_reading, "MAX_PIXELS_AT_ONCE", 2 * 12 * 16)
+    assert len(ShardSet(folder).read(0, occupancy=8).images) == 2
+    with pytest.raises(DataError, match=r"3 views of 12 x 16 are more than"):
+        ShardSet(folder).read(0, views=[0, 1, 0], occupancy=8)
 
 
 def test_folders_without_shards(tmp_path):

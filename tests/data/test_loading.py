@@ -224,7 +224,10 @@ def test_no_tar_is_read_to_choose(folder, monkeypatch):
         ({"depth": None}, OptionError, "depth"),
         ({"background": "nowhere"}, DataError, "no folder of backgrounds"),
         ({"on_error": "ignore"}, OptionError, "on_error must be one of 'raise', 'skip'"),
-        ({"max_bad_fraction": "x"}, OptionError, "max_bad_fraction"),
+        *(
+            ({"max_bad_fraction": value}, OptionError, r"max_bad_fraction must be a share in \[0, 1\]")
+            for value in ("x", -1, -1e-9, 1.001, float("nan"))
+        ),
     ],
 )
 def test_what_is_no_data_set(folder, options, error, match):
@@ -295,6 +298,28 @@ def test_too_many_bad_shapes_stop_the_run(damaged, tmp_path):
     dataset = dataset_of(damaged, on_error="skip", max_bad_fraction=1, bad_samples=damaged / "no" / "folder")
     with pytest.raises(DataError, match="folder: cannot be written"):
         dataset[0, 5]
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_bad_background_is_no_bad_shape(damaged, workers):
+    pictures = folder_of_pictures(damaged)
+    dataset = dataset_of(damaged, on_error="skip", max_bad_fraction=1, background=pictures)
+    (pictures / "noise.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    for index in (4, 5):  # a good shape, and one that another stands in for
+        loader = DataLoader(dataset, sampler=[(0, index)], collate_fn=collate, num_workers=workers)
+        with pytest.raises((DataError, RuntimeError), match=r"pictures/noise\.png: "):
+            list(loader)
+    report = damaged / "bad_samples.jsonl"
+    assert {json.loads(line)["name"] for line in report.read_text().splitlines()} == {"shape-5"}
+    with pytest.raises(DataError) as caught:
+        dataset[0, 4]
+    assert caught.value.path == (pictures / "noise.png").resolve()
+
+
+@pytest.mark.parametrize("item", [(0, 1, 2), (), (1,), [0, 1, 2], "a", (0, "a"), (0.5, 1), None])
+def test_what_is_no_item(folder, item):
+    with pytest.raises(OptionError, match="ShapeDataset: "):
+        dataset_of(folder)[item]
 
 
 def test_a_set_of_bad_shapes_ends(damaged):

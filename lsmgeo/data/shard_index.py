@@ -25,7 +25,10 @@ from lsmgeo.errors import DataError
 
 __all__ = [
     "BLOCK",
+    "MAX_MEMBERS",
+    "MAX_MEMBER_BYTES",
     "MAX_SHAPES",
+    "MAX_SIDECAR_BYTES",
     "Member",
     "ShardIndex",
     "index_tar",

@@ -20,13 +20,23 @@ from lsmgeo._checks import describe
 from lsmgeo.data.files import atomic_file
 from lsmgeo.data.members import SUFFIX, format_key
 from lsmgeo.data.metadata import decode_metadata
-from lsmgeo.data.shard_index import BLOCK, MAX_SHAPES, read_sidecar, seal, sidecar_path
+from lsmgeo.data.shard_index import (
+    BLOCK,
+    MAX_MEMBER_BYTES,
+    MAX_MEMBERS,
+    MAX_SHAPES,
+    MAX_SIDECAR_BYTES,
+    read_sidecar,
+    seal,
+    sidecar_path,
+)
 from lsmgeo.errors import DataError, OptionError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from lsmgeo.data.files import AtomicFile
+    from lsmgeo.data.metadata import Metadata
 
 __all__ = ["hash_settings", "verify_shard", "write_shard"]
 
@@ -63,6 +73,9 @@ def write_shard(
     moment, even by the loss of power, it leaves either no new shard or a whole one; the sidecar comes last. Only one
     process may write a shard at a time.
 
+    A shard holds 10,000 shapes, 1,000,000 members, each of 64 MiB, and has an index of 16 MiB at most; what has more is
+    cut into several.
+
     Args:
         path: the tar file to write, ``NAME-000000.tar``.
         items: (key, members) of each shape, in order, as `lsmgeo.data.encode_sample` makes the members.
@@ -72,8 +85,9 @@ def write_shard(
         The path written.
 
     Raises:
-        DataError: the path does not end in ``.tar``, nothing to write, or a file cannot be written.
-        OptionError: a key that is none or comes twice, a member that no shard holds, or a json that is none.
+        DataError: the path does not end in ``.tar``, or a file cannot be written.
+        OptionError: nothing to write, a key that is none, a key or a name that comes twice, a member that no shard
+            holds, a json that is none, or more than a shard holds.
 
     Example:
         >>> import tempfile, torch
@@ -94,39 +108,22 @@ def write_shard(
     sidecar = sidecar_path(path)
     for file in (path, sidecar):
         _remove_leftovers(file)
-    layouts: dict[tuple[str, ...], int] = {}
-    entries: list[dict[str, Any]] = []
+    entries = _Entries(path)
     with atomic_file(path) as stream:
         _lock(stream)
         writer = _TarWriter(stream)
         for key, members in items:
-            entries.append(_append(writer, path, format_key(key), members, layouts))
-        if not entries or len({entry["key"] for entry in entries}) != len(entries):
-            raise OptionError(
-                f"write_shard: {path}: {'a key comes twice' if entries else 'there is no shape to write'}"
-            )
-        if len(entries) > MAX_SHAPES:
-            raise OptionError(f"write_shard: {path}: {len(entries)} shapes, {MAX_SHAPES} are the limit")
+            entries.write(writer, format_key(key), members)
         writer.finish()
+        index = entries.sidecar(writer, settings_hash)
         # From here to the end the shard has no sidecar rather than one that tells of other content.
         try:
             sidecar.unlink(missing_ok=True)
         except OSError as error:
             raise DataError(sidecar, f"cannot be replaced ({error})") from error
-    index = {
-        "format": "lsmgeo shard index",
-        "version": 1,
-        "tar": path.name,
-        "bytes": writer.offset,
-        "sha256": writer.digest.hexdigest(),
-        "settings": settings_hash,
-        "shapes": len(entries),
-        "layouts": [list(layout) for layout in layouts],
-        "entries": entries,
-    }
     with atomic_file(sidecar) as stream:
         _lock(stream)
-        stream.write(seal(json.dumps(index, separators=(",", ":")).encode() + b"\n"))
+        stream.write(index)
     return path
 
 
@@ -180,31 +177,88 @@ class _TarWriter:
         self._write(bytes(-self.offset % tarfile.RECORDSIZE))
 
 
-def _append(
-    writer: _TarWriter, path: Path, key: str, members: Mapping[str, bytes], layouts: dict[tuple[str, ...], int]
-) -> dict[str, Any]:
-    """Write the members of a shape; returns its entry in the index."""
-    strange = [suffix for suffix in members if not SUFFIX.fullmatch(suffix)]
-    if strange or next(iter(members), None) != "json":
-        raise OptionError(
-            f"write_shard: {path}: the members of shape {key} must be those of encode_sample, json first; "
-            f"got {', '.join(map(repr, [*members][:8]))}"
-        )
-    try:
-        metadata = decode_metadata(members["json"], key, path)
-    except DataError as error:
-        raise OptionError(f"write_shard: {error}") from error
-    offsets = [writer.add(f"{key}.{suffix}", content) for suffix, content in members.items()]
-    return {
-        "key": key,
-        "name": metadata.name,
-        "category": metadata.category,
-        "split": metadata.split,
-        "layout": layouts.setdefault(tuple(members), len(layouts)),
-        "offsets": offsets,
-        "sizes": [len(content) for content in members.values()],
-        "crc32": [zlib.crc32(content) for content in members.values()],
-    }
+class _Entries:
+    """What the sidecar will say of the shapes, as they are written; refuses what `read_sidecar` would refuse."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._keys: set[str] = set()
+        self._names: set[str] = set()
+        self._layouts: dict[tuple[str, ...], int] = {}
+        self._texts: list[str] = []
+        self._members = self._length = 0
+
+    def write(self, writer: _TarWriter, key: str, members: Mapping[str, bytes]) -> None:
+        """Write the members of a shape, and note its entry."""
+        metadata = self._checked(key, members)
+        entry = {
+            "key": key,
+            "name": metadata.name,
+            "category": metadata.category,
+            "split": metadata.split,
+            "layout": self._layouts.setdefault(tuple(members), len(self._layouts)),
+            "offsets": [writer.add(f"{key}.{suffix}", content) for suffix, content in members.items()],
+            "sizes": [len(content) for content in members.values()],
+            "crc32": [zlib.crc32(content) for content in members.values()],
+        }
+        self._texts.append(_dumps(entry))
+        self._check_length(len(self._texts[-1]) + 1)
+
+    def _checked(self, key: str, members: Mapping[str, bytes]) -> Metadata:
+        """What the json of a shape says, after a look at all that can be told before it is written."""
+        strange = [suffix for suffix in members if not SUFFIX.fullmatch(suffix)]
+        if strange or next(iter(members), None) != "json":
+            raise self._refusal(
+                f"the members of shape {key} must be those of encode_sample, json first; "
+                f"got {', '.join(map(repr, [*members][:8]))}"
+            )
+        try:
+            metadata = decode_metadata(members["json"], key, self._path)
+        except DataError as error:
+            raise OptionError(f"write_shard: {error}") from error
+        for what, value, seen in (("key", key, self._keys), ("name", metadata.name, self._names)):
+            if value in seen:
+                raise self._refusal(f"the {what} {value!r:.80} comes twice")
+            seen.add(value)
+        if len(self._keys) > MAX_SHAPES:
+            raise self._refusal(f"more than {MAX_SHAPES} shapes; write several shards")
+        self._members += len(members)
+        if self._members > MAX_MEMBERS:
+            raise self._refusal(f"more than {MAX_MEMBERS} members; write several shards")
+        for suffix, content in members.items():
+            if len(content) > MAX_MEMBER_BYTES:
+                raise self._refusal(f"{key}.{suffix} has {len(content)} bytes, {MAX_MEMBER_BYTES} are the limit")
+        return metadata
+
+    def _check_length(self, more: int) -> None:
+        self._length += more
+        if self._length > MAX_SIDECAR_BYTES:
+            raise self._refusal(f"its index is longer than {MAX_SIDECAR_BYTES} bytes; write several shards")
+
+    def sidecar(self, writer: _TarWriter, settings_hash: str) -> bytes:
+        """The content of the sidecar of a tar that is finished."""
+        if not self._texts:
+            raise self._refusal("there is no shape to write")
+        head = {
+            "format": "lsmgeo shard index",
+            "version": 1,
+            "tar": self._path.name,
+            "bytes": writer.offset,
+            "sha256": writer.digest.hexdigest(),
+            "settings": settings_hash,
+            "shapes": len(self._texts),
+            "layouts": [list(layout) for layout in self._layouts],
+        }
+        content = seal(f'{_dumps(head)[:-1]},"entries":[{",".join(self._texts)}]}}\n'.encode())
+        self._check_length(len(content) - self._length)
+        return content
+
+    def _refusal(self, reason: str) -> OptionError:
+        return OptionError(f"write_shard: {self._path}: {reason}")
+
+
+def _dumps(value: dict[str, Any]) -> str:
+    return json.dumps(value, separators=(",", ":"))
 
 
 def _lock(stream: AtomicFile) -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lsmgeo.data import ShardSet, encode_sample, files, verify_shard, write_shard
-from lsmgeo.errors import DataError
+from lsmgeo.data import ShardSet, encode_sample, files, shard_index, shards, verify_shard, write_shard
+from lsmgeo.errors import DataError, OptionError
 from tests.data.shapes import SETTINGS, assert_equal, make_shape
 
 SAMPLE = make_shape(0).sample()
@@ -52,6 +52,42 @@ def test_a_full_disk_is_told(tmp_path, monkeypatch):
     with pytest.raises(DataError, match=r"a.tar: cannot be written .*No space left"):
         write_shard(tmp_path / "a.tar", [(0, encode_sample(SAMPLE, 0))], SETTINGS)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("limit", "there", "match"),
+    [
+        ("MAX_SHAPES", 3, "more than 2 shapes"),
+        ("MAX_MEMBERS", 27, "more than 26 members"),
+        ("MAX_MEMBER_BYTES", None, "bytes, .* are the limit"),
+        ("MAX_SIDECAR_BYTES", None, "its index is longer than"),
+    ],
+)
+def test_what_its_reader_would_refuse_is_not_written(tmp_path, monkeypatch, limit, there, match):
+    items = [(key, make_shape(key).members(key)) for key in range(3)]
+    path = write_shard(tmp_path / "a.tar", items, SETTINGS)
+    sidecar = path.with_suffix(".json")
+    content = path.read_bytes(), sidecar.read_bytes()
+    if limit == "MAX_MEMBER_BYTES":
+        there = max(len(member) for _, members in items for member in members.values())
+    elif limit == "MAX_SIDECAR_BYTES":
+        there = len(content[1])
+
+    def limit_to(value):
+        for module in (shard_index, shards):
+            monkeypatch.setattr(module, limit, value)
+
+    limit_to(there)
+    write_shard(path, items, SETTINGS)
+    assert len(ShardSet(tmp_path)) == 3
+    limit_to(there - 1)
+    with pytest.raises(DataError):
+        ShardSet(tmp_path)
+    with pytest.raises(OptionError, match=match):
+        write_shard(path, items, SETTINGS)
+    # What was there before is still there, and nothing else.
+    assert (path.read_bytes(), sidecar.read_bytes()) == content
+    assert sorted(os.listdir(tmp_path)) == ["a.json", "a.tar"]
 
 
 class Stops:

@@ -158,7 +158,8 @@ def test_what_is_no_shard(tmp_path):
     path = tmp_path / "a.tar"
     for wrong, error, match in (
         ([], OptionError, "no shape to write"),
-        ([(0, members), (0, members)], OptionError, "a key comes twice"),
+        ([(0, members), (0, members)], OptionError, "the key '00000000' comes twice"),
+        ([(0, members), (1, encode_sample(SAMPLE, 1))], OptionError, f"the name {SAMPLE.name!r} comes twice"),
         ([(1, members)], OptionError, "belongs to key"),
         ([(0, {**members, "../x": b""})], OptionError, "must be those of encode_sample"),
         ([(0, dict(reversed(members.items())))], OptionError, "json first"),

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import threading
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 
+from lsmgeo._checks import check_choice, check_whole
 from lsmgeo.data.members import encode_sample
+from lsmgeo.data.metadata import MAX_SIDE, MAX_VIEWS, MAX_VOXELS
+from lsmgeo.data.shard_index import MAX_SHAPES, read_sidecar, sidecar_path
 from lsmgeo.data.shards import hash_settings, verify_shard, write_shard
 from lsmgeo.data.sources import Recipe, Source, open_source
 from lsmgeo.errors import DataError, OptionError
@@ -46,7 +51,6 @@ class _Task(NamedTuple):
     start: int
     stop: int
     path: Path
-    settings: str
     on_error: str
 
 
@@ -70,8 +74,9 @@ def render_set(
 ) -> Made:
     """Render a set of shapes into shards, ``NAME-000000.tar`` and so on, as `ShardSet` reads them.
 
-    The bytes depend on the source, the recipe and ``per_shard`` alone, not on the number of workers, the machine's load
-    or interruptions. Shards that are there, whole and made with the same settings, are kept.
+    With one installation of the library the bytes depend on the source, the recipe and ``per_shard`` alone, not on the
+    number of workers, the machine's load or interruptions. Shards that are there, whole and made with the same
+    settings, are kept; others of the same name are made again.
 
     Work is handed out by joblib, a shard a task: to processes of this machine, or to whatever backend the caller has
     chosen with ``joblib.parallel_config``, such as a Dask cluster whose workers see the same folders.
@@ -91,7 +96,8 @@ def render_set(
 
     Raises:
         OptionError: an option out of range, or joblib is missing.
-        DataError: the source cannot be read or the folder cannot be written.
+        DataError: the source cannot be read, none of its meshes can be used, the folder cannot be written, or it holds
+            shards beyond those of this set, which a reader would take for a part of it.
 
     Example:
         >>> import tempfile
@@ -102,54 +108,66 @@ def render_set(
         (3, ['synthetic-13-000000.tar'])
     """
     recipe = Recipe() if recipe is None else recipe
-    _check(recipe, per_shard, on_error)
-    opened = open_source(source, shapes)
+    _check(recipe, per_shard, jobs, on_error)
     out = Path(out)
-    tasks = _tasks(opened, out, recipe, per_shard, on_error)
+    tasks = _tasks(open_source(source, shapes), out, recipe, per_shard, on_error)
+    _refuse_other_shards(out, tasks)
+    told = [_progress(task.path) for task in tasks]
     try:
         (out / PROGRESS).mkdir(parents=True, exist_ok=True)
+        for path in told:  # a run that was killed left them
+            path.unlink(missing_ok=True)
     except OSError as error:
         raise DataError(out, f"cannot be written ({error})") from error
     try:
-        with _bar(out, len(opened), recipe.views, progress):
+        with _bar(told, tasks[-1].stop, recipe.views, progress):
             done = _run(tasks, jobs)
     finally:
-        for path in (out / PROGRESS).glob("*"):
-            path.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
+            for path in told:
+                path.unlink(missing_ok=True)
             (out / PROGRESS).rmdir()
-    return Made(
+    made = Made(
         tuple(one.path for one in done if one.shapes),
         sum(one.shapes for one in done),
         sum(one.kept for one in done),
         tuple(skip for one in done for skip in one.skipped),
     )
+    if not made.shapes:
+        first, reason = made.skipped[0]
+        raise DataError(source, f"holds no mesh that can be used; the first: {first}: {reason}")
+    return made
 
 
-def _check(recipe: Recipe, per_shard: int, on_error: str) -> None:
-    for name, value, least, most in (
-        ("views", recipe.views, 1, 1000),
-        ("size", recipe.size, 1, 4096),
-        ("seed", recipe.seed, 0, 2**32 - 1),
-        ("per_shard", per_shard, 1, 10_000),
-    ):
-        if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
-            raise OptionError(f"render_set: {name} must be a whole number from {least} to {most}; got {value!r}")
-    voxels = recipe.voxels
-    if len(set(voxels)) != len(voxels) or not all(isinstance(side, int) and 1 <= side <= 256 for side in voxels):
-        raise OptionError(f"render_set: voxels must be different resolutions from 1 to 256; got {voxels!r}")
-    if on_error not in ("skip", "raise"):
-        raise OptionError(f"render_set: on_error must be 'skip' or 'raise'; got {on_error!r}")
+def _check(recipe: Recipe, per_shard: int, jobs: int, on_error: str) -> None:
+    check_whole("render_set", "views", recipe.views, 1, MAX_VIEWS)
+    check_whole("render_set", "size", recipe.size, 1, MAX_SIDE)
+    check_whole("render_set", "seed", recipe.seed, 0, 2**32 - 1)
+    check_whole("render_set", "per_shard", per_shard, 1, MAX_SHAPES)
+    if check_whole("render_set", "jobs", jobs, -1) == 0:
+        raise OptionError("render_set: jobs must be at least 1, or -1 for all cores; got 0")
+    for side in recipe.voxels:
+        check_whole("render_set", "voxels", side, 1, MAX_VOXELS)
+    if len(set(recipe.voxels)) != len(recipe.voxels):
+        raise OptionError(f"render_set: voxels must be different resolutions; got {recipe.voxels!r}")
+    check_choice("render_set", "on_error", on_error, ("skip", "raise"))
 
 
 def _tasks(source: Source, out: Path, recipe: Recipe, per_shard: int, on_error: str) -> list[_Task]:
     tasks = []
     for number, start in enumerate(range(0, len(source), per_shard)):
         stop = min(start + per_shard, len(source))
-        settings = hash_settings({"recipe": recipe._asdict(), "source": source.identity(start, stop)})
         path = out / f"{source.name}-{number:06d}.tar"
-        tasks.append(_Task(source, recipe, start, stop, path, settings, on_error))
+        tasks.append(_Task(source.part(start, stop), recipe, start, stop, path, on_error))
     return tasks
+
+
+def _refuse_other_shards(out: Path, tasks: list[_Task]) -> None:
+    name = tasks[0].source.name
+    expected = {task.path for task in tasks}
+    for path in sorted(out.glob(f"{glob.escape(name)}-[0-9][0-9][0-9][0-9][0-9][0-9].tar")):
+        if path not in expected:
+            raise DataError(path, "belongs to a larger set; remove that set, or name another folder")
 
 
 def _run(tasks: list[_Task], jobs: int) -> list[_Done]:
@@ -165,61 +183,69 @@ def _run(tasks: list[_Task], jobs: int) -> list[_Done]:
 
 def _make(task: _Task) -> _Done:
     """Make one shard, or find that it is there."""
-    progress = task.path.parent / PROGRESS / task.path.stem
-    if verify_shard(task.path, task.settings):
-        from lsmgeo.data.shard_index import read_sidecar
-
-        count = len(read_sidecar(task.path))
-        _tell(progress, task.stop - task.start)
-        return _Done(task.path, count, True, [])
+    settings = hash_settings(
+        {"recipe": task.recipe._asdict(), "shapes": [task.start, task.stop], "source": task.source.identity()}
+    )
+    if verify_shard(task.path, settings):
+        there = {int(key) for key in read_sidecar(task.path).keys}
+        missing = [index for index in range(task.start, task.stop) if index not in there]
+        if not missing or task.on_error == "skip":
+            _tell(task.path, task.stop - task.start)
+            reason = "could not be used when its shard was made"
+            return _Done(task.path, len(there), True, [(task.source.file(index), reason) for index in missing])
     skipped: list[tuple[str, str]] = []
-    written = 0
-
-    def items() -> Iterator[tuple[int, dict[str, bytes]]]:
-        nonlocal written
-        for index in range(task.start, task.stop):
-            try:
-                rendered = task.source.render(index, task.recipe)
-            except DataError as error:
-                if task.on_error == "raise":
-                    raise
-                skipped.append((str(error.path), error.reason))
-            else:
-                written += 1
-                yield (
-                    index,
-                    encode_sample(
-                        rendered.sample,
-                        index,
-                        more_occupancy=rendered.more_occupancy,
-                        source=task.source.name,
-                        seed=task.recipe.seed,
-                        split=rendered.split,
-                    ),
-                )
-            _tell(progress, 1)
-
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the cores are the workers', and one thread's sums have one order
     try:
-        write_shard(task.path, items(), task.settings)
-    except OptionError:
-        if written:
-            raise
-        return _Done(task.path, 0, False, skipped)
+        items = _items(task, skipped)
+        first = next(items, None)
+        if first is None:
+            task.path.unlink(missing_ok=True)
+            sidecar_path(task.path).unlink(missing_ok=True)
+            return _Done(task.path, 0, False, skipped)
+        write_shard(task.path, chain([first], items), settings)
     finally:
         torch.set_num_threads(threads)
-    return _Done(task.path, written, False, skipped)
+    return _Done(task.path, task.stop - task.start - len(skipped), False, skipped)
+
+
+def _items(task: _Task, skipped: list[tuple[str, str]]) -> Iterator[tuple[int, dict[str, bytes]]]:
+    """The shapes of a task, encoded one at a time; those that cannot be used go to ``skipped``."""
+    for index in range(task.start, task.stop):
+        try:
+            rendered = task.source.render(index, task.recipe)
+        except DataError as error:
+            if task.on_error == "raise":
+                raise
+            skipped.append((str(error.path), error.reason))
+        else:
+            yield (
+                index,
+                encode_sample(
+                    rendered.sample,
+                    index,
+                    more_occupancy=rendered.more_occupancy,
+                    source=task.source.name,
+                    seed=task.recipe.seed,
+                    split=rendered.split,
+                ),
+            )
+        _tell(task.path, 1)
+
+
+def _progress(path: Path) -> Path:
+    """The file in which the worker of a shard tells how far it is."""
+    return path.parent / PROGRESS / path.stem
 
 
 def _tell(path: Path, shapes: int) -> None:
     """Add to the shapes that a shard's worker has finished; a report that cannot be written is no reason to stop."""
-    with contextlib.suppress(OSError), path.open("ab") as stream:
+    with contextlib.suppress(OSError), _progress(path).open("ab") as stream:
         stream.write(bytes(shapes))
 
 
 @contextlib.contextmanager
-def _bar(out: Path, shapes: int, views: int, shown: bool) -> Iterator[None]:
+def _bar(told: list[Path], shapes: int, views: int, shown: bool) -> Iterator[None]:
     """A progress bar over the views of all workers, fed by what they tell."""
     if not shown:
         yield
@@ -230,7 +256,7 @@ def _bar(out: Path, shapes: int, views: int, shown: bool) -> Iterator[None]:
     bar: Any = tqdm(total=shapes * views, unit="view", disable=None)
 
     def look() -> None:
-        done = sum(path.stat().st_size for path in (out / PROGRESS).glob("*"))
+        done = sum(path.stat().st_size for path in told if path.exists())
         bar.update(done * views - bar.n)
 
     def watch() -> None:

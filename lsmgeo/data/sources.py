@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -12,8 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lsmgeo._checks import check_whole
+from lsmgeo.data.metadata import is_text
 from lsmgeo.data.sample import Sample
-from lsmgeo.errors import DataError, OptionError
+from lsmgeo.errors import DataError, LsmGeoError, OptionError
 
 __all__ = ["MeshFolder", "Recipe", "Rendered", "Source", "Synthetic13", "open_source"]
 
@@ -62,8 +65,14 @@ class Source(Protocol):
 
     def __len__(self) -> int: ...
 
-    def identity(self, start: int, stop: int) -> Any:
-        """What shapes start to stop depend on besides the recipe, as JSON can hold it."""
+    def part(self, start: int, stop: int) -> Source:
+        """The same source with nothing but shapes start to stop, which keep their numbers: what one task needs."""
+
+    def identity(self) -> Any:
+        """What its shapes depend on besides the recipe, as JSON can hold it."""
+
+    def file(self, index: int) -> str:
+        """What a shape is made from, in a message."""
 
     def render(self, index: int, recipe: Recipe) -> Rendered:
         """One shape.
@@ -83,9 +92,17 @@ class Synthetic13:
     def __len__(self) -> int:
         return self.count
 
-    def identity(self, start: int, stop: int) -> Any:
+    def part(self, start: int, stop: int) -> Synthetic13:
+        """Itself: a shape is made from its number."""
+        return self
+
+    def identity(self) -> Any:
         """The version of the generators."""
-        return [self.name, VERSION, start, stop]
+        return VERSION
+
+    def file(self, index: int) -> str:
+        """Its number."""
+        return f"shape {index}"
 
     def render(self, index: int, recipe: Recipe) -> Rendered:
         """Views and voxels of one synthetic shape, exact."""
@@ -122,14 +139,35 @@ class MeshFolder:
     root: Path
     files: tuple[str, ...]  # relative to the root, with forward slashes
     name: str
+    first: int = 0  # the number of the first file
 
     def __len__(self) -> int:
         return len(self.files)
 
-    def identity(self, start: int, stop: int) -> Any:
-        """Paths and sizes of the files."""
-        some = self.files[start:stop]
-        return [VERSION, start, [[file, (self.root / file).stat().st_size] for file in some]]
+    def part(self, start: int, stop: int) -> MeshFolder:
+        """The files of these shapes alone: a task need not carry the paths of a whole tree."""
+        return replace(self, files=self.files[start - self.first : stop - self.first], first=start)
+
+    def identity(self) -> Any:
+        """SHA-256 of the files and of the material files beside them, and what casts the rays."""
+        caster = "embree" if find_spec("embreex") else "numpy"  # what render_mesh takes
+        return [VERSION, caster, [[file, *self._digests(file)] for file in self.files]]
+
+    def _digests(self, file: str) -> list[str]:
+        path = self.root / file
+        try:
+            beside = sorted(path.parent.glob("*.mtl")) if path.suffix.lower() == ".obj" else []
+            digests = []
+            for one in (path, *beside):
+                with one.open("rb") as stream:
+                    digests.append(hashlib.file_digest(stream, "sha256").hexdigest())
+            return digests
+        except OSError as error:
+            return [f"cannot be read ({error})"]
+
+    def file(self, index: int) -> str:
+        """Its path."""
+        return str(self.root / self.files[index - self.first])
 
     def render(self, index: int, recipe: Recipe) -> Rendered:
         """Views and voxels of one mesh.
@@ -137,12 +175,19 @@ class MeshFolder:
         Raises:
             DataError: the file is no mesh that can be used.
         """
+        try:
+            return self._render(self.files[index - self.first], index, recipe)
+        except DataError:
+            raise
+        except LsmGeoError as error:  # what only shows when the mesh is used: no extent, colours out of range
+            raise DataError(self.file(index), str(error)) from error
+
+    def _render(self, file: str, index: int, recipe: Recipe) -> Rendered:
         from lsmgeo.data.mesh_rendering import render_mesh
         from lsmgeo.data.meshes import load_mesh, normalise
         from lsmgeo.data.voxelise import voxelise
         from lsmgeo.scenes import synthetic13
 
-        file = self.files[index]
         mesh = normalise(load_mesh(self.root / file))
         cameras = synthetic13.views(recipe.seed, index, recipe.views, recipe.size)
         lights = synthetic13.random_lights(np.random.default_rng([recipe.seed, index, LIGHTS]))
@@ -159,7 +204,7 @@ class MeshFolder:
             occupancy=grids[0] if grids else None,
             mesh=file,
             category=_category(file),
-            name=file.rpartition(".")[0],
+            name=file,
         )
         return Rendered(sample, tuple(grids[1:]), split_by_name(file))
 
@@ -194,27 +239,30 @@ def open_source(source: str | Path, shapes: int | None = None) -> Source:
         OptionError: no number of shapes for synthetic-13, or fewer than one.
         DataError: the folder cannot be read or holds no mesh.
     """
-    if shapes is not None and shapes < 1:
-        raise OptionError(f"shapes must be at least 1; got {shapes}")
+    if shapes is not None:
+        shapes = check_whole("render_set", "shapes", shapes, 1, 10**8)
     if str(source) == "synthetic-13":
         if shapes is None:
-            raise OptionError("shapes must be given for synthetic-13, which has no end")
+            raise OptionError("render_set: shapes must be given for synthetic-13, which has no end; got None")
         return Synthetic13(shapes)
     root = Path(source)
     if not root.is_dir():
         raise DataError(root, "is no folder of meshes, and not 'synthetic-13'")
-    try:
-        root = root.resolve()
-        # Links are not followed: they may lead outside, or in circles.
-        found = []
-        for folder, _, names in os.walk(root):
-            below = Path(folder).relative_to(root)
-            found += [(below / name).as_posix() for name in names if name.lower().endswith(MESH_SUFFIXES)]
-        found = sorted(file for file in found if not (root / file).is_symlink())
-    except OSError as error:
-        raise DataError(root, f"cannot be read ({error})") from error
+
+    def refuse(error: OSError) -> None:
+        raise DataError(error.filename or root, f"cannot be read ({error})") from error
+
+    found = []
+    root = root.resolve()
+    for folder, _, names in os.walk(root, onerror=refuse):  # links to folders are not followed
+        below = Path(folder).relative_to(root)
+        found += [(below / name).as_posix() for name in names if name.lower().endswith(MESH_SUFFIXES)]
+    found = sorted(file for file in found if not (root / file).is_symlink())
     if not found:
         raise DataError(root, f"holds no mesh ({', '.join(MESH_SUFFIXES)})")
     if len(found) > MAX_MESHES:
         raise DataError(root, f"holds {len(found)} meshes, the limit is {MAX_MESHES}")
-    return MeshFolder(root, tuple(found[:shapes]), root.name)
+    strange = next((file for file in found if not is_text(file)), None)
+    if strange is not None:
+        raise DataError(root, f"holds a mesh whose name is too long or not printable: {strange[:80]!r}")
+    return MeshFolder(root, tuple(found[:shapes]), root.name.lstrip(".") or "meshes")

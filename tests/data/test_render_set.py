@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import joblib
 import numpy as np
@@ -100,7 +101,8 @@ def test_the_command_resumes_after_a_kill(alone, tmp_path):
             break
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
-    process.wait()
+    assert process.wait() == -signal.SIGKILL, "the set was done before it could be interrupted"
+    assert not (tmp_path / "synthetic-13-000003.json").exists()
     first = tmp_path / "synthetic-13-000000.tar"
     before = first.stat().st_mtime_ns
     again = subprocess.run([*command, "--jobs", "2"], check=True, capture_output=True, text=True)
@@ -109,7 +111,20 @@ def test_the_command_resumes_after_a_kill(alone, tmp_path):
     assert contents(tmp_path) == contents(alone)
 
 
-def test_whole_shards_are_kept_and_damaged_ones_made_again(alone, tmp_path, capsys):
+class Bar:
+    """What is asked of a progress bar."""
+
+    def __init__(self) -> None:
+        self.n = 0
+
+    def update(self, more: int) -> None:
+        self.n += more
+
+    def close(self) -> None:
+        pass
+
+
+def test_whole_shards_are_kept_and_damaged_ones_made_again(alone, tmp_path):
     make(tmp_path)
     second = tmp_path / "synthetic-13-000001.tar"
     content = bytearray(second.read_bytes())
@@ -122,9 +137,26 @@ def test_whole_shards_are_kept_and_damaged_ones_made_again(alone, tmp_path, caps
     assert contents(tmp_path) == contents(alone)
     changed = {path.name for path in tmp_path.glob("*.tar") if path.stat().st_mtime_ns != times[path.name]}
     assert changed == {"synthetic-13-000001.tar", "synthetic-13-000002.tar"}
+    # What a killed run told of its progress is forgotten.
+    (tmp_path / ".progress").mkdir()
+    (tmp_path / ".progress" / "synthetic-13-000000").write_bytes(bytes(1000))
+    with mock.patch("tqdm.tqdm", mock.Mock(return_value=Bar())) as shown:
+        made = render_set("synthetic-13", tmp_path, RECIPE, shapes=SHAPES, per_shard=PER_SHARD, jobs=1, progress=True)
+    assert shown.call_args.kwargs["total"] == shown.return_value.n == RECIPE.views * SHAPES
+    assert made.kept == 4
+    assert not (tmp_path / ".progress").exists()
     # Another recipe makes everything again.
     other = RECIPE._replace(seed=4)
     assert render_set("synthetic-13", tmp_path, other, shapes=SHAPES, per_shard=PER_SHARD, jobs=1).kept == 0
+
+
+def test_shards_of_a_larger_set_are_not_taken_for_part_of_it(tmp_path):
+    make(tmp_path)
+    before = contents(tmp_path)
+    for options in ({"shapes": 2, "per_shard": 2}, {"shapes": SHAPES, "per_shard": 3}):
+        with pytest.raises(DataError, match="larger set"):
+            render_set("synthetic-13", tmp_path, RECIPE, jobs=1, **options)
+    assert contents(tmp_path) == before
 
 
 def test_a_longer_set_begins_with_the_shorter(alone, tmp_path):
@@ -168,8 +200,54 @@ def test_a_tree_of_meshes_becomes_a_set(tree, tmp_path):
     again = render_set(tree, tmp_path / "again", RECIPE, jobs=1)
     assert again.shapes == 2
     assert contents(tmp_path / "set") == contents(tmp_path / "again")
+    with joblib.parallel_config("multiprocessing"):
+        render_set(tree, tmp_path / "many", RECIPE, per_shard=1, jobs=2)
+    shared = ShardSet(tmp_path / "many")
+    torch.testing.assert_close(shared.read(0, occupancy=16)[:5], first[:5], rtol=0, atol=0)
     with pytest.raises(DataError, match=r"model\.obj"):
         render_set(tree, tmp_path / "raise", RECIPE, jobs=1, on_error="raise")
+    # What is there is kept, and what was left out is told again, or refused.
+    kept = render_set(tree, tmp_path / "set", RECIPE, jobs=1)
+    assert (kept.kept, [Path(path).name for path, _ in kept.skipped]) == (1, ["model.obj"])
+    with pytest.raises(DataError, match=r"model\.obj"):
+        render_set(tree, tmp_path / "set", RECIPE, jobs=1, on_error="raise")
+
+
+def test_a_changed_mesh_is_rendered_again(tree, tmp_path):
+    render_set(tree, tmp_path / "set", RECIPE, per_shard=1, jobs=1)
+    path = tree / "lamps" / "second" / "models" / "model_normalized.obj"
+    text = path.read_text()
+    path.write_text(text.replace("0.5", "0.6", 1))
+    assert path.stat().st_size == len(text)
+    assert render_set(tree, tmp_path / "set", RECIPE, per_shard=1, jobs=1).kept == 1
+    path.with_name("colours.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    assert render_set(tree, tmp_path / "set", RECIPE, per_shard=1, jobs=1).kept == 1
+    assert render_set(tree, tmp_path / "set", RECIPE, per_shard=1, jobs=1).kept == 2
+    # One that can no longer be used leaves no shard behind.
+    path.write_text("f 1 2 3\n")
+    assert render_set(tree, tmp_path / "set", RECIPE, per_shard=1, jobs=1).shapes == 1
+    assert len(ShardSet(tmp_path / "set")) == 1
+
+
+def test_one_model_in_two_formats_is_two_shapes(tmp_path):
+    (tmp_path / "tree").mkdir()
+    for ending in ("obj", "off"):
+        trimesh.creation.box((1.0, 2.0, 0.5)).export(tmp_path / "tree" / f"model.{ending}")
+    assert render_set(tmp_path / "tree", tmp_path / "set", RECIPE, jobs=1).shapes == 2
+    assert ShardSet(tmp_path / "set").names == ["model.obj", "model.off"]
+
+
+def test_a_tree_without_a_usable_mesh_is_an_error(tmp_path, capsys):
+    (tmp_path / "tree").mkdir()
+    (tmp_path / "tree" / "model.obj").write_text("nothing")
+    with pytest.raises(DataError, match=r"no mesh that can be used.*model\.obj"):
+        render_set(tmp_path / "tree", tmp_path / "set", RECIPE, jobs=1)
+    assert list((tmp_path / "set").iterdir()) == []
+    (tmp_path / "tree" / "new\nline.obj").write_text("nothing")
+    with pytest.raises(DataError, match="not printable"):
+        render_set(tmp_path / "tree", tmp_path / "set", RECIPE, jobs=1)
+    assert cli.main(["render", "--source", str(tmp_path / "tree"), "--out", str(tmp_path / "set")]) == 2
+    assert "not printable" in capsys.readouterr().err
 
 
 def test_splits_by_name_have_their_shares():
@@ -182,7 +260,9 @@ def test_splits_by_name_have_their_shares():
     ("options", "error", "words"),
     [
         ({"source": "synthetic-13"}, OptionError, "shapes must be given"),
-        ({"source": "synthetic-13", "shapes": 0}, OptionError, "at least 1"),
+        ({"source": "synthetic-13", "shapes": 0}, OptionError, "shapes must be a whole number"),
+        ({"source": "synthetic-13", "shapes": 1.5}, OptionError, "shapes must be a whole number"),
+        ({"source": "synthetic-13", "shapes": 3, "jobs": 0}, OptionError, "jobs must be at least 1"),
         ({"source": "nowhere", "shapes": 3}, DataError, "no folder of meshes"),
         ({"source": ".", "shapes": 3}, DataError, "holds no mesh"),
         ({"source": "synthetic-13", "shapes": 3, "recipe": Recipe(views=0)}, OptionError, "views must be"),
@@ -195,7 +275,7 @@ def test_splits_by_name_have_their_shares():
 def test_bad_options_are_named(tmp_path, monkeypatch, options, error, words):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(error, match=words):
-        render_set(out=tmp_path / "set", jobs=1, **options)
+        render_set(out=tmp_path / "set", **{"jobs": 1, **options})
     assert os.listdir(tmp_path) == []
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from hypothesis import assume
 from hypothesis import strategies as st
 
 from lsmgeo import scenes
@@ -73,14 +74,17 @@ def drawn(draw, size=(15, 20)) -> Drawn:
         away = [make(cut, rng, rng.normal(size=3), 0.7) for cut in cuts]
         ours.append(solid.minus(*(cut for cut, _ in away)))
         theirs.append(truth.Part(shape, tuple(cut for _, cut in away)))
-    return Drawn(scenes.Scene(ours), theirs, cameras(rng, size, up), size)
+    views = cameras(rng, size, up)
+    eyes = -(views.cam_from_world[0, :, :3, :3].mT @ views.cam_from_world[0, :, :3, 3:])[..., 0].numpy()
+    assume(not any(part.shape.holds(eyes).any() for part in theirs))
+    return Drawn(scenes.Scene(ours), theirs, views, size)
 
 
 def cameras(rng: np.random.Generator, size: tuple[int, int], up: np.ndarray, views: int = 2) -> CameraTensors:
-    """Cameras with skew above the scene, that no solid contains."""
+    """Cameras with skew above the scene, far away or close by."""
     K, E = [], []
     for _ in range(views):
-        eye = up * rng.uniform(2.5, 4) + rng.normal(size=3) * 0.3
+        eye = up * rng.uniform(0.7, 4) + rng.normal(size=3) * 0.3
         rotation, translation = oracle.look_at(eye, rng.uniform(-0.2, 0.2, 3), rng.normal(size=3))
         f = rng.uniform(1.2, 2.2, 2) * size[1]
         K.append([[f[0], 0.1 * f[0], size[1] * 0.45], [0, f[1], size[0] * 0.55], [0, 0, 1]])

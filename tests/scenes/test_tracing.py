@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lsmgeo import VoxelGrid, scenes
-from lsmgeo.cameras import CameraTensors, orbit
+from lsmgeo.cameras import CameraTensors, orbit, resize
 from lsmgeo.scenes import rendering
 from tests import oracle
 from tests.oracle import solids as truth
@@ -273,3 +273,24 @@ def test_nothing_is_recorded_for_derivatives():
     assert not any(value.requires_grad for value in found)
     dark = scenes.Lights(torch.zeros(0, 3), torch.zeros(0, 3), torch.ones(3))
     assert float(scenes.render([scene], view, dark, shadows=True).images[0, 0, 0, 4, 4]) == pytest.approx(0.7)
+
+
+@settings(max_examples=30)
+@given(drawn(), st.integers(0, 2))
+def test_a_mirrored_scene_is_the_mirrored_picture(wanted, axis):
+    origins, directions = (torch.from_numpy(np.array(rays))[None] for rays in wanted.rays(0))
+    mirror = torch.ones(3, dtype=torch.float64)
+    mirror[axis] = -1
+    expected = scenes.trace([wanted.scene], origins, directions)
+    reflected = scenes.Scene([solid.mirrored(axis) for solid in wanted.scene.solids])
+    found = scenes.trace([reflected], origins * mirror, directions * mirror)
+    torch.testing.assert_close(found.distance, expected.distance, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(found.points, expected.points * mirror, rtol=1e-9, atol=1e-9)
+
+
+@settings(max_examples=30)
+@given(drawn())
+def test_another_size_is_another_camera(wanted):
+    found = scenes.render([wanted.scene], wanted.cameras, SUN, size=(23, 17), dtype=torch.float64)
+    expected = scenes.render([wanted.scene], resize(wanted.cameras, 23, 17), SUN, dtype=torch.float64)
+    torch.testing.assert_close(found.depth, expected.depth, rtol=1e-9, atol=1e-9)

@@ -1,5 +1,6 @@
 """The shapes of Synthetic-13: varied, upright, connected, of parts without a common face."""
 
+import hashlib
 import importlib
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.ndimage import label
 
 from lsmgeo import scenes
 from lsmgeo.cameras import CameraTensors
+from lsmgeo.data import sources
 from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.scenes import synthetic13
 from lsmgeo.scenes.synthetic13 import __main__ as program
@@ -237,6 +239,54 @@ def test_the_numbers_are_those_of_the_seeded_stream():
     if backs[picks[1]] != "none":
         stream.integers(3)
     assert chair.parameters["seat_height"] == pytest.approx(0.3 + 0.45 * stream.random(), rel=1e-12)
+
+
+DIGESTS_OF_VERSION = 1
+DIGESTS = {
+    "airplane": "c3477cf5edae",
+    "bench": "e5d66bbd32c9",
+    "cabinet": "2eca2384937a",
+    "car": "83218fc2d871",
+    "chair": "225289afe722",
+    "display": "ab93372069d9",
+    "lamp": "f032567e3221",
+    "speaker": "acbd7624655b",
+    "rifle": "30b714e7621c",
+    "sofa": "9da3e2c4d9ef",
+    "table": "401130ce67bf",
+    "telephone": "d14d112fec96",
+    "vessel": "a0b90e2566c2",
+}
+
+
+def digest(category):
+    """Of two shapes with their views: numbers to 1e-9, for LAPACK rounds differently elsewhere."""
+    found = hashlib.sha256()
+    for index in (0, 1):
+        shape = synthetic13.shape(0, index, category)
+        views = synthetic13.views(0, index, 2, 64)
+        numbers = [*shape.parameters.values(), *shape.counts.values()]
+        words = [shape.name, *shape.structure, *shape.parameters, *shape.counts, synthetic13.split(0, index)]
+        for solid in shape.scene.solids:
+            for part in (solid, *solid.cuts):
+                numbers += [*part.world_from_local.ravel(), part.taper]
+                words.append(part.kind.name)
+            look = solid.material
+            numbers += [*look.colour, *look.second, look.frequency, look.seed]
+            words.append(look.texture)
+        for tensor in (*shape.lights, views.intrinsics, views.cam_from_world):
+            numbers += tensor.flatten().tolist()
+        found.update("|".join(words).encode())
+        found.update(np.rint(np.array(numbers) * 1e9).astype("<i8").tobytes())
+    return found.hexdigest()[:12]
+
+
+def test_what_a_seed_gives_belongs_to_a_version():
+    digests = {category: digest(category) for category in CATEGORIES}
+    assert (sources.VERSION, digests) == (DIGESTS_OF_VERSION, DIGESTS), (
+        "What a seed gives has changed, so training sets change: raise lsmgeo.data.sources.VERSION, and put the new "
+        "version and the new digests here."
+    )
 
 
 def test_a_category_can_be_asked_for():

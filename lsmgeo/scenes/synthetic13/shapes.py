@@ -1,4 +1,8 @@
-"""Shapes by number: one seed and index give one shape, its lights and its views, on every machine and in any order."""
+"""Shapes by number: one seed and index give one shape, its lights and its views, in any order and in any set.
+
+Equal numbers give equal shapes on one installation. Elsewhere they may differ by rounding, with the LAPACK that numpy
+was built with, and altogether, should numpy ever change a stream.
+"""
 
 from __future__ import annotations
 

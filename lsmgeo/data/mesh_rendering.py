@@ -16,18 +16,19 @@ from lsmgeo.cameras.tensors import Cameras, check_cameras
 from lsmgeo.cameras.transforms import common_size
 from lsmgeo.data.mesh_topology import corner_normals, face_normals
 from lsmgeo.data.meshes import DEFAULT_COLOUR, Mesh, check_mesh
-from lsmgeo.data.ray_casting import BACKENDS, RayCaster, make_caster
+from lsmgeo.data.ray_casting import BACKENDS, RayCaster, make_caster, row_dots
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
 from lsmgeo.scenes import Lights, Rendering, shade
 
 __all__ = ["render_mesh"]
 
-# Shadow rays leave a surface from this far above it, relative to the size of the mesh and the camera's distance: well
+# Shadow rays leave a surface from this far above it, relative to the size of the mesh, however far the camera is: well
 # above what float32 loses there, well below a pixel.
-SHADOW_OFFSET = 3e-5
+SHADOW_OFFSET = 1e-4
 RAYS_AT_ONCE = 1 << 18
 
 
+@torch.no_grad()
 def render_mesh(
     mesh: Mesh,
     cameras: Cameras,
@@ -58,12 +59,12 @@ def render_mesh(
         crease: degrees, 0 to 180.
         background: RGB behind the mesh, (3,), or anything that broadcasts to (V, 3, H, W).
         size: (H, W) of the images; by default the cameras' own. K is resized for it.
-        backend: "embree" (a 224 x 224 view in about 30 ms), "numpy" (no extra package, some hundred times slower), or
-            "auto": the first that is installed.
+        backend: "embree", "numpy" (needs no extra package; far slower), or "auto": the first that is installed.
 
     Returns:
         `lsmgeo.scenes.Rendering` on the CPU, without the axis of scenes: images (V, 3, H, W) float32, depth (V, H, W)
-        float32, world normals (V, 3, H, W) float32 and mask (V, H, W) bool. Not differentiable.
+        float32, world normals (V, 3, H, W) float32 and mask (V, H, W) bool. Not differentiable: tensors that
+        require gradients are taken as they are, and the result requires none.
 
     Raises:
         DTypeError: not a `Mesh`, not `Lights`.
@@ -97,9 +98,9 @@ def render_mesh(
     assert size is not None
     lights = _checked_lights(who, lights)
     matrices = camera_matrices(tensors, size)
-    centers = matrices.center.cpu().numpy()
-    from_pixel = multiply(matrices.rotation.transpose(-1, -2), inverse_3x3(matrices.intrinsics)).cpu().numpy()
-    projections = matrices.projection.cpu().numpy()
+    centers = matrices.center.numpy(force=True)
+    from_pixel = multiply(matrices.rotation.transpose(-1, -2), inverse_3x3(matrices.intrinsics)).numpy(force=True)
+    projections = matrices.projection.numpy(force=True)
 
     images = _behind(who, background, (len(centers), 3, *size))
     depth, mask = torch.zeros(len(centers), *size), torch.zeros(len(centers), *size, dtype=torch.bool)
@@ -158,12 +159,12 @@ class _Surface:
         points = center + depth[:, None] * directions[found]
         along = directions[found].astype(np.float32)
         flat = self.flat[face]
-        side = np.where(_dot(flat, along) > 0, np.float32(-1), np.float32(1))
+        side = np.where(row_dots(flat, along) > 0, np.float32(-1), np.float32(1))[:, None]
         flat = flat * side
         normal = flat
         if self.corners is not None:
             normal = _towards_viewer(side * _mix(self.corners[face], hits.weights[found]), flat, along)
-        lit = self._lit(points, flat, normal, center, lights) if shadows else None
+        lit = self._lit(points, flat, normal, lights) if shadows else None
 
         grey = np.broadcast_to(np.array(DEFAULT_COLOUR, np.float32), (len(face), 3))
         albedo = torch.from_numpy(np.array(grey if self.mesh.face_colours is None else self.mesh.face_colours[face]))
@@ -174,12 +175,9 @@ class _Surface:
         out.depth.view(-1)[at] = torch.from_numpy(depth.astype(np.float32))
         out.mask.view(-1)[at] = True
 
-    def _lit(
-        self, points: np.ndarray, flat: np.ndarray, normal: np.ndarray, center: np.ndarray, lights: Lights
-    ) -> Tensor:
+    def _lit(self, points: np.ndarray, flat: np.ndarray, normal: np.ndarray, lights: Lights) -> Tensor:
         """(K, L) bool, whether points see each light; those turned away from it do not."""
-        offset = SHADOW_OFFSET * (self.extent + float(np.abs(center - self.mesh.vertices[self.mesh.faces[0, 0]]).max()))
-        start = points + offset * flat
+        start = points + SHADOW_OFFSET * self.extent * flat
         lit = np.zeros((len(points), len(lights.directions)), bool)
         for index, direction in enumerate(lights.directions.double().numpy()):
             # Where a flat face turns away it shades itself, however its smooth normal stands.
@@ -196,16 +194,11 @@ def _mix(corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.einsum("nk,nki->ni", np.stack((1 - second - third, second, third), 1), corners)
 
 
-def _dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(K, 1): along the last axis."""
-    return np.einsum("ni,ni->n", first, second)[:, None]
-
-
 def _towards_viewer(normal: np.ndarray, flat: np.ndarray, along: np.ndarray) -> np.ndarray:
     """Unit normals that do not look away: at silhouettes an interpolated one may, and is laid across the ray."""
-    away = np.maximum(_dot(normal, along) / _dot(along, along), 0)
-    normal = normal - away * along
-    length = np.sqrt(_dot(normal, normal))
+    away = np.maximum(row_dots(normal, along) / row_dots(along, along), 0)
+    normal = normal - away[:, None] * along
+    length = np.sqrt(row_dots(normal, normal))[:, None]
     return np.where(length > 1e-6, normal / np.maximum(length, np.float32(1e-6)), flat)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from lsmgeo.errors import BackendError
 
-__all__ = ["BACKENDS", "EmbreeCaster", "NumpyCaster", "RayCaster", "RayHits", "make_caster"]
+__all__ = ["BACKENDS", "EmbreeCaster", "NumpyCaster", "RayCaster", "RayHits", "make_caster", "row_dots"]
 
 BACKENDS = ("embree", "numpy")
 # Leaves of the numpy tree hold this many triangles, and this many (ray, box) pairs are held at once.
@@ -66,7 +66,11 @@ def make_caster(vertices: np.ndarray, faces: np.ndarray, backend: str = "auto") 
 
 
 class EmbreeCaster:
-    """Rays by embree, in float32; the mesh is moved and scaled to unit size first, so that no precision is lost."""
+    """Rays by embree, in float32.
+
+    The mesh is moved to the origin and scaled to unit size, and rays begin near it: neither its place and unit nor how
+    far the rays come from cost precision.
+    """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         from embreex.mesh_construction import TriangleMesh
@@ -74,38 +78,50 @@ class EmbreeCaster:
 
         low, high = vertices.min(0), vertices.max(0)
         self.origin, self.scale = 0.5 * low + 0.5 * high, float((high - low).max()) or 1.0
-        corners = vertices[faces]
+        points = (vertices - self.origin) / self.scale
+        self.radius = 1.01 * float(np.sqrt(row_dots(points, points).max()))  # of a ball around it, with room to spare
+        corners = points[faces]
         self.normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        self.heights = (self.normals * (corners[:, 0] - self.origin)).sum(1)  # of the planes above the origin
+        self.heights = row_dots(self.normals, corners[:, 0])  # of the planes above the origin
         # Robust: no ray slips between two triangles that share an edge.
         self.scene = EmbreeScene(robust=True)
-        points = np.ascontiguousarray((vertices - self.origin) / self.scale, np.float32)
-        TriangleMesh(self.scene, points, np.ascontiguousarray(faces, np.int32))
+        TriangleMesh(self.scene, np.ascontiguousarray(points, np.float32), np.ascontiguousarray(faces, np.int32))
 
-    def _scaled(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Both scaled alike, so that distances in multiples of the direction stay as they are."""
-        return ((origins - self.origin) / self.scale).astype(np.float32), (directions / self.scale).astype(np.float32)
+    def _scaled(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rays in the frame of the moved mesh, with origins just outside the ball around it where they were beyond.
+
+        The last array says how far they were moved, in multiples of the directions, which keep their lengths in it.
+        """
+        along = directions / self.scale
+        start = (origins - self.origin) / self.scale
+        square = row_dots(along, along)
+        begin = np.maximum(-(row_dots(start, along) + self.radius * np.sqrt(square)) / square, 0.0)
+        start += begin[:, None] * along
+        return start, along, begin
 
     def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> RayHits:
         """Where rays first meet the mesh; the distance is computed again in float64 with the triangle found."""
-        found = self.scene.run(*self._scaled(origins, directions), output=True)
+        start, along, begin = self._scaled(origins, directions)
+        found = self.scene.run(start.astype(np.float32), along.astype(np.float32), output=True)
         face, distance = found["primID"].astype(np.int64), found["tfar"].astype(np.float64)
         hit = np.flatnonzero(face >= 0)
         normal, about = self.normals[face[hit]], distance[hit]
-        height = self.heights[face[hit]] - _dot(normal, origins[hit] - self.origin)
-        speed = _dot(normal, directions[hit])
+        height = self.heights[face[hit]] - row_dots(normal, start[hit])
+        speed = row_dots(normal, along[hit])
         exact = np.divide(height, speed, out=np.full(len(hit), np.inf), where=speed != 0)
         # On a triangle seen edge-on the plane says little, and embree's own distance stays.
-        distance[hit] = np.where(np.abs(exact - about) <= 1e-4 * about, exact, about)
-        return RayHits(face, distance, np.stack((found["u"], found["v"]), 1).astype(np.float64))
+        size = self.radius / np.sqrt(row_dots(along[hit], along[hit]))
+        distance[hit] = np.where(np.abs(exact - about) <= 1e-4 * (about + size), exact, about)
+        return RayHits(face, begin + distance, np.stack((found["u"], found["v"]), 1).astype(np.float64))
 
     def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Whether rays meet the mesh at all."""
-        return self.scene.run(*self._scaled(origins, directions), query="OCCLUDED") >= 0
+        start, along, _ = self._scaled(origins, directions)
+        return self.scene.run(start.astype(np.float32), along.astype(np.float32), query="OCCLUDED") >= 0
 
 
 class NumpyCaster:
-    """Rays by a tree of boxes in numpy, in float64; some hundred times slower than embree."""
+    """Rays by a tree of boxes in numpy, in float64; far slower than embree."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         corners = vertices[faces]
@@ -186,8 +202,8 @@ class NumpyCaster:
         return self.first_hits(origins, directions).face >= 0
 
 
-def _dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Along the last axis; einsum needs no array of products."""
+def row_dots(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Dot products (N,) of the rows of two arrays (N, 3); einsum needs no array of products."""
     return np.einsum("ni,ni->n", first, second)
 
 

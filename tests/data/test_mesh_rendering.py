@@ -105,19 +105,61 @@ def test_depth_reaches_the_same_points_whatever_the_unit_and_place():
     torch.testing.assert_close(picture.depth[both] * 100, reference.depth[both], atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize("distance", [1e3, 1e5, 1e7])
+def test_far_cameras_see_what_near_ones_see(distance):
+    # In float32, a camera at this distance says nothing of where on the mesh its rays pass.
+    mesh = trimesh.util.concatenate([trimesh.creation.icosphere(3, 0.3), trimesh.creation.box((0.8, 0.1, 0.1))])
+    azimuth = torch.tensor([30.0, 100.0], dtype=F64)
+    far = cameras.orbit(azimuth, 20.0, distance, focal_length=30 * distance, height=36, width=40)
+    fast, slow = (
+        render_mesh(from_trimesh(mesh), far, sun((0.3, 1, 0.2)), backend=backend) for backend in ("embree", "numpy")
+    )
+    assert int(slow.mask.sum()) > 500
+    assert int((fast.mask ^ slow.mask).sum()) <= 1
+    both = fast.mask & slow.mask
+    torch.testing.assert_close(fast.depth[both], slow.depth[both], rtol=2 * TERMWISE[F32], atol=0)
+    assert int(((fast.images - slow.images).abs().amax(1) > 1e-3)[both].sum()) <= 3
+
+
+def test_the_casters_agree_on_far_rays():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    vertices, faces = np.asarray(ball.vertices) + 7.0, np.asarray(ball.faces)
+    rng = np.random.default_rng(0)
+    targets = rng.uniform(-0.7, 0.7, (1000, 3)) + 7.0
+    directions = rng.normal(size=(1000, 3))
+    directions *= 10.0 ** rng.uniform(-3, 3, (1000, 1)) / np.linalg.norm(directions, axis=1, keepdims=True)
+    # From within the ball to far beyond it, before it and behind it.
+    origins = targets - directions * rng.choice([-1e8, -1.0, 0.0, 1.0, 1e4, 1e8], (1000, 1))
+    fast, slow = (caster(vertices, faces) for caster in (EmbreeCaster, NumpyCaster))
+    hits, expected = fast.first_hits(origins, directions), slow.first_hits(origins, directions)
+    hit = expected.face >= 0
+    assert 200 < hit.sum() < 800
+    assert ((hits.face >= 0) == hit).mean() > 0.995
+    assert (fast.blocked(origins, directions) == hit).mean() > 0.995
+    same = hit & (hits.face == expected.face)
+    assert same.sum() > 0.98 * hit.sum()
+    # What is lost is the rounding of the origins themselves.
+    np.testing.assert_allclose(hits.distance[same], expected.distance[same], rtol=1e-10, atol=1e-6)
+
+
 def test_shadows_fall_where_they_must():
     # A square above a floor; the light comes from straight above, so the shadow is the square itself.
     floor = np.array([[-0.5, -0.2, -0.5], [-0.5, -0.2, 0.5], [0.5, -0.2, 0.5], [0.5, -0.2, -0.5]])
     square = floor * [0.4, 1, 0.4] + [0.05, 0.3, -0.1]
     mesh = Mesh(np.concatenate((floor, square)), np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]))
-    camera = cameras.orbit(torch.tensor([40.0]), 50.0, 2.0, focal_length=150.0, height=96, width=96)
-    for light, shift in (((0, 1, 0), np.zeros(2)), ((0.3, 1, -0.2), 0.3 * np.array([-0.3, 0.2]))):
+    near = cameras.orbit(torch.tensor([40.0]), 50.0, 2.0, focal_length=150.0, height=96, width=96)
+    far = cameras.orbit(torch.tensor([40.0], dtype=F64), 50.0, 2e4, focal_length=150e4, height=96, width=96)
+    for light, shift, camera, rounding in (
+        ((0, 1, 0), np.zeros(2), near, 1e-4),
+        ((0.3, 1, -0.2), 0.3 * np.array([-0.3, 0.2]), near, 1e-4),
+        ((0, 1, 0), np.zeros(2), far, 1e-2),
+    ):
         picture = render_mesh(mesh, camera, sun(light))
         plain = render_mesh(mesh, camera, sun(light), shadows=False)
         center, directions = rays(view_of(cameras.to(camera, F64), 0))
         on_floor = center + (-0.2 - center[1]) / directions[..., 1:2] * directions
         # Only pixels whose ray meets the floor first, and not within a hair of an edge.
-        seen = np.abs(picture.depth[0].numpy() - (-0.2 - center[1]) / directions[..., 1]) < 1e-4
+        seen = np.abs(picture.depth[0].numpy() - (-0.2 - center[1]) / directions[..., 1]) < rounding
         away = np.abs(on_floor[..., [0, 2]] - (np.array([0.05, -0.1]) + shift)).max(-1) - 0.2
         shadow, lit = seen & (away < -0.003), seen & (away > 0.003)
         assert shadow.sum() > 100
@@ -269,6 +311,20 @@ def test_sizes_views_and_bits():
     behind = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     picture = render_mesh(mesh, many, sun((0, 1, 0)), background=behind)
     assert torch.equal(picture.images.movedim(1, -1)[~picture.mask], behind.movedim(1, -1)[~picture.mask])
+
+
+def test_what_requires_gradients_is_rendered_all_the_same():
+    mesh, many, lights = from_trimesh(trimesh.creation.box((0.5, 0.4, 0.3))), views(2, 16), sun((0.3, 1, 0.2))
+    behind = torch.tensor([0.1, 0.2, 0.3])
+    expected = render_mesh(mesh, many, lights, background=behind)
+    tracked = many._replace(
+        intrinsics=many.intrinsics.clone().requires_grad_(), cam_from_world=many.cam_from_world.clone().requires_grad_()
+    )
+    lights = scenes.Lights(*(field.clone().requires_grad_() for field in lights))
+    picture = render_mesh(mesh, tracked, lights, background=behind.requires_grad_())
+    for one, other in zip(picture, expected, strict=True):
+        assert torch.equal(one, other)
+        assert not one.requires_grad
 
 
 def test_options_are_checked():

@@ -25,7 +25,9 @@ class Lights(NamedTuple):
 
 
 def shade(albedo: Tensor, normals: Tensor, lights: Lights, lit: Tensor | None = None) -> Tensor:
-    """The colour of Lambertian surfaces: ``albedo * (ambient + sum over l of max(0, n . d_l) colour_l)``, in [0, 1].
+    """The colour of Lambertian surfaces.
+
+    Equation: albedo (ambient + sum over l of max(0, <n, d_l>) colour_l), no more than 1.
 
     Args:
         albedo: (..., 3) RGB.

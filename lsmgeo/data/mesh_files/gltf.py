@@ -109,12 +109,15 @@ class _File:
 
     def __init__(self, document: dict[str, Any], buffers: list[bytes]) -> None:
         self.document, self.buffers = document, buffers
+        self.checked: dict[str, list[dict[str, Any]]] = {}
 
     def items(self, name: str) -> list[dict[str, Any]]:
-        found = self.document.get(name, [])
-        if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
-            raise Unreadable(f"{name} must be a list of objects")
-        return found
+        if name not in self.checked:  # once, not for every node of a long list
+            found = self.document.get(name, [])
+            if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
+                raise Unreadable(f"{name} must be a list of objects")
+            self.checked[name] = found
+        return self.checked[name]
 
     def item(self, name: str, index: Any) -> dict[str, Any]:
         items = self.items(name)

@@ -160,7 +160,7 @@ def _matrices(field: str, rows: Any, views: int, side: int) -> np.ndarray:
 
 
 def _are_plainly_cameras(K: np.ndarray, E: np.ndarray) -> bool:
-    """Whether finite cameras are good beyond doubt; what is not, `check_cameras` looks at, in ten times the time."""
+    """Whether finite cameras are good beyond doubt; what is not, `check_cameras`, far slower, looks at."""
     R = E[:, :3, :3]
     return bool(
         (K[:, 2] == (0, 0, 1)).all()

@@ -71,7 +71,7 @@ def render_mesh(
         ShapeError: shapes that do not belong together.
         OptionError: an impossible option.
         CameraError: bad cameras, or views of different sizes and no ``size``.
-        BackendError: embree was asked for by name and is not installed.
+        BackendError: embree was asked for by name and is not installed, or ``smooth`` without scipy.
 
     Example:
         >>> import torch, trimesh

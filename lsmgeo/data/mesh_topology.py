@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lsmgeo.errors import BackendError
+
 __all__ = [
     "Edges",
     "Parts",
@@ -101,9 +103,13 @@ def is_watertight(vertices: np.ndarray, faces: np.ndarray) -> bool:
 
 def components(count: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Which group each of ``count`` things belongs to, first[i] and second[i] being in one; (count,) int64 from 0."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
+    try:
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+    except ImportError as error:
+        raise BackendError(
+            "smooth normals and the parts of a mesh need the package scipy; install lsmgeo[data]"
+        ) from error
     links = coo_array((np.ones(len(first), np.int8), (first, second)), shape=(count, count))
     return connected_components(links, directed=False)[1].astype(np.int64)
 

@@ -13,7 +13,7 @@ from lsmgeo._checks import check_choice, check_flag
 from lsmgeo.data.mesh_topology import Parts, are_real, disagreeing, distinct_faces, merged_faces, parts_of
 from lsmgeo.data.meshes import Mesh, check_mesh
 from lsmgeo.data.scan_conversion import LINES, Line, cells_touched, crossing_counts, first_and_last, line_extent
-from lsmgeo.errors import OptionError
+from lsmgeo.errors import BackendError, OptionError
 from lsmgeo.grids import VoxelGrid
 
 __all__ = ["Plan", "plan_voxels", "voxelise"]
@@ -83,14 +83,15 @@ def voxelise(
         upper: upper bounds.
 
     Returns:
-        (D, H, W) bool, axes z, y, x; centres as in `lsmgeo.VoxelGrid`. What is outside the grid is cut off. At 256^3
-        about 0.6 GB are needed beside the result.
+        (D, H, W) bool, axes z, y, x; centres as in `lsmgeo.VoxelGrid`. What is outside the grid is cut off. Beside
+        the result several arrays of whole numbers of the grid's size are held.
 
     Raises:
         DTypeError: not a `Mesh`, or arrays of other types.
         ShapeError: a wrong shape.
         GridError: an impossible grid.
         OptionError: an unknown method, a resolution above 512, or vertices that are not finite.
+        BackendError: scipy is not installed.
 
     Example:
         >>> import numpy as np
@@ -125,8 +126,10 @@ def voxelise(
     elif method == "escape":
         solid = _enclosed(triangles, count)
     else:
-        from scipy import ndimage
-
+        try:
+            from scipy import ndimage
+        except ImportError as error:
+            raise BackendError(f"{who}: method='surface' needs the package scipy; install lsmgeo[data]") from error
         solid = ndimage.binary_fill_holes(cells_touched(triangles, count) > 0)
     if keep_thin:
         solid = _with_thin(solid, cells_touched(triangles, count))

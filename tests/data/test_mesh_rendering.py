@@ -270,6 +270,15 @@ def test_without_embree_numpy_takes_over(monkeypatch):
         render_mesh(box, views(1, 16), sun((0, 1, 0)), backend="embree")
 
 
+def test_without_scipy_normals_are_flat_or_the_extra_is_named(monkeypatch):
+    box = from_trimesh(trimesh.creation.box((0.5, 0.4, 0.3)))
+    for name in ("scipy", "scipy.sparse"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert render_mesh(box, views(1, 16), sun((0, 1, 0)), smooth=False).mask.any()
+    with pytest.raises(BackendError, match=r"smooth normals .* scipy; install lsmgeo\[data\]"):
+        render_mesh(box, views(1, 16), sun((0, 1, 0)))
+
+
 def test_the_window_of_the_mesh_loses_nothing():
     box = from_trimesh(trimesh.creation.box((0.5, 0.4, 0.3)))
     many = views(3, 40)

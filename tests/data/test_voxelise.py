@@ -1,6 +1,7 @@
 """Solid voxels against exact occupancy that does not know the mesh, and what becomes of meshes with faults."""
 
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from lsmgeo.data import Mesh, from_trimesh, load_mesh, normalise, voxelise
 from lsmgeo.data.mesh_topology import merged_faces, parts_of
 from lsmgeo.data.scan_conversion import LINES, cells_touched, crossings
 from lsmgeo.data.voxelise import plan_voxels, winding_number
-from lsmgeo.errors import DTypeError, GridError, OptionError
+from lsmgeo.errors import BackendError, DTypeError, GridError, OptionError
 from lsmgeo.scenes.meshing import to_mesh
 
 ROOT = os.environ.get("LSMGEO_TEST_DATA")
@@ -304,6 +305,17 @@ def test_the_same_input_gives_the_same_bits():
     kept = Mesh(mesh.vertices, mesh.faces[np.random.default_rng(0).random(len(mesh.faces)) >= 0.1])
     for method in ("auto", "winding", "parity", "escape", "surface"):
         assert torch.equal(voxelise(kept, method=method), voxelise(kept, method=method))
+
+
+def test_without_scipy_the_extra_is_named(monkeypatch):
+    box = from_trimesh(trimesh.creation.box((0.5, 0.4, 0.3)))
+    expected = voxelise(box, 8)
+    for name in ("scipy", "scipy.sparse"):
+        monkeypatch.setitem(sys.modules, name, None)
+    for method in ("auto", "surface"):
+        with pytest.raises(BackendError, match=r"scipy; install lsmgeo\[data\]"):
+            voxelise(box, 8, method=method)
+    assert torch.equal(voxelise(box, 8, method="winding"), expected)
 
 
 def test_options_are_checked():

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_choice, check_flag, check_float, check_number, check_size, describe
+from lsmgeo._checks import check_choice, check_flag, check_number, check_size
 from lsmgeo._linalg import inverse_3x3, multiply
 from lsmgeo.cameras import as_tensors
 from lsmgeo.cameras.matrices import camera_matrices
@@ -17,8 +17,9 @@ from lsmgeo.cameras.transforms import common_size
 from lsmgeo.data.mesh_topology import corner_normals, face_normals
 from lsmgeo.data.meshes import DEFAULT_COLOUR, Mesh, check_mesh
 from lsmgeo.data.ray_casting import BACKENDS, RayCaster, make_caster, row_dots
-from lsmgeo.errors import DTypeError, OptionError, ShapeError
+from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.scenes import Lights, Rendering, shade
+from lsmgeo.scenes.inputs import behind, checked_lights
 
 __all__ = ["render_mesh"]
 
@@ -96,13 +97,13 @@ def render_mesh(
     check_cameras(who, tensors)
     size = common_size(who, tensors) if size is None else check_size(who, "size", size, 2, "(h, w)")  # type: ignore[assignment]
     assert size is not None
-    lights = _checked_lights(who, lights)
+    lights = Lights(*(value[0] for value in checked_lights(who, lights, 1, torch.device("cpu"), torch.float32)))
     matrices = camera_matrices(tensors, size)
     centers = matrices.center.numpy(force=True)
     from_pixel = multiply(matrices.rotation.transpose(-1, -2), inverse_3x3(matrices.intrinsics)).numpy(force=True)
     projections = matrices.projection.numpy(force=True)
 
-    images = _behind(who, background, (len(centers), 3, *size))
+    images = behind(who, background, (len(centers), 3, *size), torch.device("cpu"), torch.float32)
     depth, mask = torch.zeros(len(centers), *size), torch.zeros(len(centers), *size, dtype=torch.bool)
     out = Rendering(images, depth, torch.zeros_like(images), mask)
     flat = face_normals(mesh.vertices, mesh.faces)
@@ -200,26 +201,3 @@ def _towards_viewer(normal: np.ndarray, flat: np.ndarray, along: np.ndarray) -> 
     normal = normal - away[:, None] * along
     length = np.sqrt(row_dots(normal, normal))[:, None]
     return np.where(length > 1e-6, normal / np.maximum(length, np.float32(1e-6)), flat)
-
-
-def _checked_lights(who: str, lights: Lights) -> Lights:
-    if not isinstance(lights, Lights):
-        raise DTypeError(f"{who}: lights must be Lights; got {describe(lights)}")
-    for name, value, rank in zip(lights._fields, lights, (2, 2, 1), strict=True):
-        check_float(who, f"lights.{name}", value, "(L, 3), ambient (3,)", rank)
-        if value.shape[-1] != 3 or (rank == 2 and value.shape != lights.directions.shape):
-            shapes = [tuple(field.shape) for field in lights]
-            raise ShapeError(f"{who}: lights must be (L, 3), (L, 3) and (3,); got {shapes}")
-    return Lights(*(value.detach().cpu().float() for value in lights))
-
-
-def _behind(who: str, value: Tensor | Sequence[float], shape: tuple[int, ...]) -> Tensor:
-    """A new array of the images' shape that holds what is behind the mesh."""
-    try:
-        colour = torch.as_tensor(value, dtype=torch.float32, device="cpu")
-        colour = colour[:, None, None] if colour.dim() == 1 else colour
-        return colour.expand(shape).clone(memory_format=torch.contiguous_format)
-    except (RuntimeError, TypeError, ValueError) as error:
-        raise ShapeError(
-            f"{who}: background must be RGB (3,) or broadcast to (V, 3, H, W) = {shape}; got {describe(value)}"
-        ) from error

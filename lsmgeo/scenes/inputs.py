@@ -42,8 +42,8 @@ def checked_lights(who: str, lights: Lights, count: int, device: torch.device, d
         whole.append(value.detach().to(device, dtype))
     if whole[0].shape != whole[1].shape:
         raise ShapeError(
-            f"{who}: lights.directions and lights.colours must agree; got {tuple(whole[0].shape)} and "
-            f"{tuple(whole[1].shape)}"
+            f"{who}: lights.directions and lights.colours must agree; got "
+            f"{tuple(lights.directions.shape)} and {tuple(lights.colours.shape)}"
         )
     return Lights(*whole)
 

@@ -344,7 +344,7 @@ def test_options_are_checked():
         render_mesh(mesh, cameras.stack([many]), light)
     with pytest.raises(DTypeError, match="lights must be Lights"):
         render_mesh(mesh, many, tuple(light))
-    with pytest.raises(ShapeError, match=r"lights must be \(L, 3\)"):
+    with pytest.raises(ShapeError, match=r"colours must agree; got \(1, 3\) and \(2, 3\)"):
         render_mesh(mesh, many, light._replace(colours=torch.ones(2, 3)))
     with pytest.raises(OptionError, match="crease must be degrees"):
         render_mesh(mesh, many, light, crease=181)

@@ -141,7 +141,7 @@ def render(
     views: int = 20,
     out: str = "lsmgeo-set",
     size: int = 224,
-    voxels: tuple[int, ...] = (32, 64),
+    voxels: str = "32,64",
     depth: bool = True,
     shadows: bool = False,
     seed: int = 0,
@@ -149,6 +149,7 @@ def render(
     jobs: int = -1,
     cluster: str | None = None,
     on_error: Literal["skip", "raise"] = "skip",
+    overwrite: bool = False,
 ) -> None:
     """Make a training set: views, depth and voxels of many shapes, in tar shards; run again, it goes on where it was.
 
@@ -158,7 +159,7 @@ def render(
         views: pictures of each shape.
         out: folder for the shards; created where it does not exist.
         size: height and width of the pictures in pixels.
-        voxels: resolutions of the occupancy grids.
+        voxels: resolutions of the occupancy grids, such as 32 or 32,64.
         depth: whether to write depth.
         shadows: whether shapes cast shadows on themselves.
         seed: decides shapes, lights and views.
@@ -166,13 +167,22 @@ def render(
         jobs: worker processes; -1 takes all cores.
         cluster: address of a Dask scheduler whose workers see the same folders; by default this machine works alone.
         on_error: what to do with a mesh that cannot be used.
+        overwrite: whether to make shards again that were made with other settings.
     """
     import contextlib
     import time
+    from importlib.util import find_spec
     from pathlib import Path
 
     from lsmgeo.data import Recipe, render_set
+    from lsmgeo.errors import OptionError
 
+    if not re.fullmatch(r"[0-9]+(,[0-9]+)*", voxels):
+        raise OptionError(f"render: voxels must be whole numbers with commas between, such as 32,64; got {voxels!r}")
+    sides = tuple(int(side[:6]) for side in voxels.split(","))
+    if jobs == -1 and cluster is None and not find_spec("joblib"):
+        print("lsmgeo: one process works; pip install 'lsmgeo[data]' lets all cores work", file=sys.stderr)
+        jobs = 1
     start = time.perf_counter()
     with contextlib.ExitStack() as stack:
         if cluster is not None:
@@ -180,11 +190,12 @@ def render(
         made = render_set(
             source,
             out,
-            Recipe(seed, views, size, voxels, depth, shadows),
+            Recipe(seed, views, size, sides, depth, shadows),
             shapes=shapes,
             per_shard=per_shard,
             jobs=jobs,
             on_error=on_error,
+            overwrite=overwrite,
             progress=True,
         )
     seconds = time.perf_counter() - start

@@ -86,6 +86,9 @@ class Mesh:
             raise OptionError(f"Mesh: face_colours must be in [0, 1]; got {colours.min()}..{colours.max()}")
         object.__setattr__(self, "face_colours", colours)
 
+    def __repr__(self) -> str:
+        return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
+
     @cached_property
     def watertight(self) -> bool:
         """Whether every edge belongs to exactly two faces; vertices in one place count as one."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import glob
+import re
+import sys
 import threading
+import time
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
@@ -12,7 +14,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from lsmgeo._checks import check_choice, check_whole
+from lsmgeo._checks import check_choice, check_flag, check_whole
 from lsmgeo.data.members import encode_sample
 from lsmgeo.data.metadata import MAX_SIDE, MAX_VIEWS, MAX_VOXELS
 from lsmgeo.data.shard_index import MAX_SHAPES, read_sidecar, sidecar_path
@@ -25,6 +27,7 @@ __all__ = ["Made", "render_set"]
 # Where workers tell how far they are, one byte a shape.
 PROGRESS = ".progress"
 SECONDS_BETWEEN_LOOKS = 0.5
+SECONDS_BETWEEN_LINES = 30.0
 
 
 class Made(NamedTuple):
@@ -70,13 +73,14 @@ def render_set(
     per_shard: int = 50,
     jobs: int = -1,
     on_error: str = "skip",
+    overwrite: bool = False,
     progress: bool = False,
 ) -> Made:
     """Render a set of shapes into shards, ``NAME-000000.tar`` and so on, as `ShardSet` reads them.
 
     With one installation of the library the bytes depend on the source, the recipe and ``per_shard`` alone, not on the
-    number of workers, the machine's load or interruptions. Shards that are there, whole and made with the same
-    settings, are kept; others of the same name are made again.
+    number of workers, the machine's load or interruptions. Shards that are there and whole are kept; damaged ones, and
+    those whose meshes have changed, are made again.
 
     Work is handed out by joblib, a shard a task: to processes of this machine, or to whatever backend the caller has
     chosen with ``joblib.parallel_config``, such as a Dask cluster whose workers see the same folders.
@@ -89,6 +93,7 @@ def render_set(
         per_shard: shapes in a shard.
         jobs: worker processes; -1 takes all cores, 1 works in this process.
         on_error: "skip" leaves out meshes that cannot be used and reports them, "raise" stops at the first.
+        overwrite: make shards again that were made with another recipe; without it they are an error.
         progress: show a bar.
 
     Returns:
@@ -97,7 +102,7 @@ def render_set(
     Raises:
         OptionError: an option out of range, or joblib is missing.
         DataError: the source cannot be read, none of its meshes can be used, the folder cannot be written, or it holds
-            shards beyond those of this set, which a reader would take for a part of it.
+            shards of another recipe, or beyond those of this set, which a reader would take for a part of it.
 
     Example:
         >>> import tempfile
@@ -109,9 +114,12 @@ def render_set(
     """
     recipe = Recipe() if recipe is None else recipe
     _check(recipe, per_shard, jobs, on_error)
+    check_flag("render_set", "overwrite", overwrite)
     out = Path(out)
+    if out.exists() and not out.is_dir():
+        raise DataError(out, "is a file; the shards need a folder")
     tasks = _tasks(open_source(source, shapes), out, recipe, per_shard, on_error)
-    _refuse_other_shards(out, tasks)
+    _refuse_other_shards(out, tasks, overwrite)
     told = [_progress(task.path) for task in tasks]
     try:
         (out / PROGRESS).mkdir(parents=True, exist_ok=True)
@@ -162,12 +170,27 @@ def _tasks(source: Source, out: Path, recipe: Recipe, per_shard: int, on_error: 
     return tasks
 
 
-def _refuse_other_shards(out: Path, tasks: list[_Task]) -> None:
+def _refuse_other_shards(out: Path, tasks: list[_Task], overwrite: bool) -> None:
+    """Refuse a folder that would come to hold two sets in one."""
     name = tasks[0].source.name
-    expected = {task.path for task in tasks}
-    for path in sorted(out.glob(f"{glob.escape(name)}-[0-9][0-9][0-9][0-9][0-9][0-9].tar")):
-        if path not in expected:
+    ours = {task.path for task in tasks}
+    recipe = _recipe_hash(tasks[0].recipe)
+    for path in sorted(out.glob("*.tar")):
+        if path not in ours and re.fullmatch(re.escape(name) + "-[0-9]{6}", path.stem):
             raise DataError(path, "belongs to a larger set; remove that set, or name another folder")
+        if overwrite and path in ours:
+            continue
+        try:
+            settings = read_sidecar(path).settings or ""
+        except DataError:  # what is damaged is made again
+            continue
+        if not settings.startswith(recipe):
+            raise DataError(path, "was made with other settings; name another folder, or ask to overwrite it")
+
+
+def _recipe_hash(recipe: Recipe) -> str:
+    """What the settings of a shard begin with."""
+    return hash_settings(recipe._asdict())[:32]
 
 
 def _run(tasks: list[_Task], jobs: int) -> list[_Done]:
@@ -183,9 +206,8 @@ def _run(tasks: list[_Task], jobs: int) -> list[_Done]:
 
 def _make(task: _Task) -> _Done:
     """Make one shard, or find that it is there."""
-    settings = hash_settings(
-        {"recipe": task.recipe._asdict(), "shapes": [task.start, task.stop], "source": task.source.identity()}
-    )
+    made_from = hash_settings({"shapes": [task.start, task.stop], "source": task.source.identity()})
+    settings = f"{_recipe_hash(task.recipe)}-{made_from}"
     if verify_shard(task.path, settings):
         there = {int(key) for key in read_sidecar(task.path).keys}
         missing = [index for index in range(task.start, task.stop) if index not in there]
@@ -246,23 +268,30 @@ def _tell(path: Path, shapes: int) -> None:
 
 @contextlib.contextmanager
 def _bar(told: list[Path], shapes: int, views: int, shown: bool) -> Iterator[None]:
-    """A progress bar over the views of all workers, fed by what they tell."""
+    """A progress bar over the views of all workers, fed by what they tell; in a log, a line now and then."""
     if not shown:
         yield
         return
     from tqdm import tqdm
 
     finished = threading.Event()
-    bar: Any = tqdm(total=shapes * views, unit="view", disable=None)
+    total = shapes * views
+    bar: Any = tqdm(total=total, unit="view", disable=None)
+    is_log, spoke = not sys.stderr.isatty(), time.monotonic()
 
-    def look() -> None:
-        done = sum(path.stat().st_size for path in told if path.exists())
-        bar.update(done * views - bar.n)
+    def look() -> int:
+        done = views * sum(path.stat().st_size for path in told if path.exists())
+        bar.update(done - bar.n)
+        return done
 
     def watch() -> None:
+        nonlocal spoke
         while not finished.wait(SECONDS_BETWEEN_LOOKS):
             with contextlib.suppress(OSError):
-                look()
+                done = look()
+                if is_log and time.monotonic() - spoke > SECONDS_BETWEEN_LINES:
+                    spoke = time.monotonic()
+                    print(f"{done} of {total} views", file=sys.stderr, flush=True)
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()

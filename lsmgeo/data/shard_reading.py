@@ -87,6 +87,9 @@ class ShardSet:
             both = [shard.path.name for shard in self._shards if name in shard.names]
             raise DataError(folder, f"two shapes are named {name!r}, in {both[0]} and {both[-1]}")
 
+    def __repr__(self) -> str:
+        return f"ShardSet({str(self.folder)!r}, {len(self)} shapes)"
+
     def __len__(self) -> int:
         return len(self.names)
 

@@ -77,8 +77,9 @@ def voxelise(
         resolution: voxels along each side, or (D, H, W); 512 at most.
         method: one of the above.
         keep_thin: add what is thinner than a voxel and would be lost: the voxels that the surface passes through
-            where no solid voxel is next to them, as seen along the surface's normals. By default only with "auto";
-            without it, all but "surface" are strictly solid-by-centre.
+            where no solid voxel is next to them, as seen along the surface's normals. By default only with "auto", and
+            only where the mesh is not watertight: of a watertight one exactly the voxels whose centres are inside are
+            solid, however few. Without it, all but "surface" are strictly solid-by-centre.
         lower: lower bounds of the grid, world units, a number or (x, y, z).
         upper: upper bounds.
 

@@ -93,8 +93,8 @@ class Solid:
             raise OptionError("Solid: world_from_local must be invertible; a size is zero")
         if not 0 <= self.taper <= 1:
             raise OptionError(f"Solid: taper must be in [0, 1]; got {self.taper!r}")
-        if any(cut.cuts for cut in self.cuts):
-            raise OptionError("Solid: what is cut out can have no cuts of its own")
+        if not all(isinstance(cut, Solid) and not cut.cuts for cut in self.cuts):
+            raise OptionError("Solid: what is cut out must be Solids with no cuts of their own")
         matrix.setflags(write=False)
         object.__setattr__(self, "world_from_local", matrix)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import os
 import signal
 import subprocess
@@ -23,6 +24,7 @@ from lsmgeo.data.sources import split_by_name
 from lsmgeo.errors import DataError, OptionError
 from lsmgeo.scenes import synthetic13
 
+progress_of = sys.modules["lsmgeo.data.render_set"]
 RECIPE = Recipe(seed=3, views=2, size=24, voxels=(8, 16))
 SHAPES, PER_SHARD = 7, 2
 
@@ -74,7 +76,7 @@ def test_a_dask_cluster_gives_the_same_bytes(alone, tmp_path):
     distributed = pytest.importorskip("distributed")
     options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
     with distributed.LocalCluster(**options) as cluster:
-        arguments = ["render", "--out", str(tmp_path), "--cluster", cluster.scheduler_address, "--voxels", "[8,16]"]
+        arguments = ["render", "--out", str(tmp_path), "--cluster", cluster.scheduler_address, "--voxels", "8,16"]
         arguments += ["--shapes", str(SHAPES), "--views", "2", "--size", "24", "--seed", "3", "--per_shard", "2"]
         assert cli.main(arguments) == 0
     assert contents(tmp_path) == contents(alone)
@@ -90,7 +92,7 @@ def test_the_command_resumes_after_a_kill(alone, tmp_path):
         "--out",
         str(tmp_path),
         "--voxels",
-        "[8,16]",
+        "8,16",
         "--seed",
         "3",
     ]
@@ -145,9 +147,15 @@ def test_whole_shards_are_kept_and_damaged_ones_made_again(alone, tmp_path):
     assert shown.call_args.kwargs["total"] == shown.return_value.n == RECIPE.views * SHAPES
     assert made.kept == 4
     assert not (tmp_path / ".progress").exists()
-    # Another recipe makes everything again.
+    # Another recipe is refused, unless it is said that the set may go.
     other = RECIPE._replace(seed=4)
-    assert render_set("synthetic-13", tmp_path, other, shapes=SHAPES, per_shard=PER_SHARD, jobs=1).kept == 0
+    before = contents(tmp_path)
+    with pytest.raises(DataError, match=r"000000\.tar: was made with other settings"):
+        render_set("synthetic-13", tmp_path, other, shapes=SHAPES, per_shard=PER_SHARD, jobs=1)
+    assert contents(tmp_path) == before
+    options = {"shapes": SHAPES, "per_shard": PER_SHARD, "jobs": 1, "overwrite": True}
+    assert render_set("synthetic-13", tmp_path, other, **options).kept == 0
+    assert contents(tmp_path).keys() == before.keys()
 
 
 def test_shards_of_a_larger_set_are_not_taken_for_part_of_it(tmp_path):
@@ -281,8 +289,42 @@ def test_bad_options_are_named(tmp_path, monkeypatch, options, error, words):
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "set").write_text("a file in the way")
-    with pytest.raises(DataError, match="set"):
+    with pytest.raises(DataError, match="is a file"):
         make(tmp_path / "set")
+
+
+def test_long_work_tells_a_log_how_far_it_is(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(progress_of, "SECONDS_BETWEEN_LOOKS", 0.01)
+    monkeypatch.setattr(progress_of, "SECONDS_BETWEEN_LINES", 0.02)
+    render_set("synthetic-13", tmp_path, RECIPE, shapes=30, per_shard=30, jobs=1, progress=True)
+    assert " of 60 views" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("voxels", ["", "8,", "many", "8;16", "[8]"])
+def test_resolutions_are_numbers_with_commas(tmp_path, capsys, voxels):
+    arguments = ["render", "--shapes", "1", "--out", str(tmp_path / "set"), f"--voxels={voxels}"]
+    assert cli.main(arguments) == 2
+    assert "such as 32,64" in capsys.readouterr().err
+
+
+def test_without_joblib_one_process_works(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "joblib", None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    arguments = [
+        "render",
+        "--shapes",
+        "1",
+        "--views",
+        "1",
+        "--size",
+        "16",
+        "--voxels",
+        "8",
+        "--out",
+        str(tmp_path / "set"),
+    ]
+    assert cli.main(arguments) == 0
+    assert "one process works" in capsys.readouterr().err
 
 
 def test_a_cluster_that_does_not_answer_is_named(tmp_path, capsys, monkeypatch):

@@ -178,7 +178,8 @@ def test_another_size_sees_the_same():
         (lambda: BALL.transformed(np.eye(3)), "must be affine"),
         (lambda: scenes.Scene([]), "one at least"),
         (lambda: scenes.Scene(["ball"]), "must be Solids"),
-        (lambda: BALL.solids[0].minus(BALL.solids[0].minus(BALL.solids[0])), "no cuts of its own"),
+        (lambda: BALL.solids[0].minus(BALL.solids[0].minus(BALL.solids[0])), "no cuts of their own"),
+        (lambda: BALL.solids[0].minus(1), "must be Solids"),
     ],
 )
 def test_impossible_scenes_are_refused(make, words):

@@ -23,6 +23,10 @@ DEVICE_CODE := lsmgeo/kernels/gpu_kernels.py,lsmgeo/kernels/gpu_gradients.py
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
+# A plain path to the checkout: the default form of an editable install loses to a folder of the package's name beside the
+# script that imports it.
+EDITABLE := --config-settings editable_mode=compat -e
+
 # uv installs in a tenth of pip's time. It is used where it is on PATH or can be fetched, and pip does the work otherwise.
 # $(1): bin folder of the environment, $(2): what to install
 define install
@@ -42,12 +46,12 @@ SOURCES := setup.cfg setup.py pyproject.toml $(wildcard lsmgeo/kernels/native/*)
 
 $(VENV)/.core: $(SOURCES) | $(BIN)/python
 	@echo 'installing lsmgeo into $(VENV) (once; PyTorch is large)'
-	$(call install,$(BIN),-e .)
+	$(call install,$(BIN),$(EDITABLE) .)
 	@touch $@
 
 $(VENV)/.dev: $(SOURCES) | $(BIN)/python
 	@echo 'installing lsmgeo and what its tests and docs need into $(VENV) (once; PyTorch is large)'
-	$(call install,$(BIN),-e '.[dev]')
+	$(call install,$(BIN),$(EDITABLE) '.[dev]')
 	@touch $(VENV)/.core $@
 
 setup: $(VENV)/.dev ## make the environment, with everything for tests and docs

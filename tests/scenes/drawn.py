@@ -60,12 +60,12 @@ def make(kind: str, rng: np.random.Generator, up: np.ndarray, scale: float) -> t
     return scenes.cone(start, end, *radii), shape
 
 
-@st.composite
-def drawn(draw, size=(15, 20)) -> Drawn:
-    """Up to four solids with up to two cuts each, seen from two random cameras with skew."""
-    solid = st.tuples(st.sampled_from(KINDS), st.lists(st.sampled_from(KINDS), max_size=2))
-    names = draw(st.lists(solid, min_size=1, max_size=4))
-    rng = np.random.default_rng(draw(st.integers(0, 2**20)))
+Names = list[tuple[str, list[str]]]  # of each solid: its kind, and the kinds of what is cut out of it
+
+
+def build(names: Names, seed: int, size: tuple[int, int] = (15, 20)) -> Drawn | None:
+    """A scene of these kinds, seen from two random cameras with skew; None if a solid would hold a camera."""
+    rng = np.random.default_rng(seed)
     up = rng.normal(size=3)
     up /= np.linalg.norm(up)
     ours, theirs = [], []
@@ -76,8 +76,19 @@ def drawn(draw, size=(15, 20)) -> Drawn:
         theirs.append(truth.Part(shape, tuple(cut for _, cut in away)))
     views = cameras(rng, size, up)
     eyes = -(views.cam_from_world[0, :, :3, :3].mT @ views.cam_from_world[0, :, :3, 3:])[..., 0].numpy()
-    assume(not any(part.shape.holds(eyes).any() for part in theirs))
+    if any(part.shape.holds(eyes).any() for part in theirs):
+        return None
     return Drawn(scenes.Scene(ours), theirs, views, size)
+
+
+@st.composite
+def drawn(draw, size=(15, 20)) -> Drawn:
+    """Up to four solids with up to two cuts each."""
+    solid = st.tuples(st.sampled_from(KINDS), st.lists(st.sampled_from(KINDS), max_size=2))
+    found = build(draw(st.lists(solid, min_size=1, max_size=4)), draw(st.integers(0, 2**20)), size)
+    assume(found is not None)
+    assert found is not None
+    return found
 
 
 def cameras(rng: np.random.Generator, size: tuple[int, int], up: np.ndarray, views: int = 2) -> CameraTensors:

@@ -17,7 +17,7 @@ from lsmgeo._checks import (
     check_size,
     describe,
 )
-from lsmgeo._linalg import cross, homogeneous_row, inverse_3x3, multiply, transform
+from lsmgeo._linalg import cross, homogeneous_row, multiply, transform
 from lsmgeo.cameras.matrices import camera_matrices, resize_matrix
 from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, check_cameras, image_sizes
 from lsmgeo.debugging import can_inspect
@@ -345,8 +345,7 @@ def rays(cameras: Cameras, size: tuple[int, int] | None = None) -> tuple[Tensor,
         indexing="ij",
     )
     pixels = torch.stack((u, v, torch.ones_like(u)), -1)  # (h, w, 3)
-    world_from_pixel = multiply(matrices.rotation.transpose(-1, -2), inverse_3x3(matrices.intrinsics))
-    directions = transform(world_from_pixel[..., None, None, :, :], pixels)
+    directions = transform(matrices.world_from_pixel[..., None, None, :, :], pixels)
     directions = directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True)
     return (matrices.center + 0.0).to(dtype), directions.to(dtype)
 

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from lsmgeo._checks import check_choice, check_flag, check_number, check_size
-from lsmgeo._linalg import inverse_3x3, multiply
 from lsmgeo.cameras import as_tensors
 from lsmgeo.cameras.matrices import camera_matrices
 from lsmgeo.cameras.tensors import Cameras, check_cameras
@@ -100,7 +99,7 @@ def render_mesh(
     lights = Lights(*(value[0] for value in checked_lights(who, lights, 1, torch.device("cpu"), torch.float32)))
     matrices = camera_matrices(tensors, size)
     centers = matrices.center.numpy(force=True)
-    from_pixel = multiply(matrices.rotation.transpose(-1, -2), inverse_3x3(matrices.intrinsics)).numpy(force=True)
+    from_pixel = matrices.world_from_pixel.numpy(force=True)
     projections = matrices.projection.numpy(force=True)
 
     images = behind(who, background, (len(centers), 3, *size), torch.device("cpu"), torch.float32)

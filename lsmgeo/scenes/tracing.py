@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from lsmgeo._linalg import inverse_3x3, multiply, transform
+from lsmgeo._linalg import multiply, transform
 from lsmgeo.cameras.matrices import CameraMatrices
 from lsmgeo.scenes.intervals import interval
 from lsmgeo.scenes.solids import Kind
@@ -118,8 +118,7 @@ class CameraRays:
         self.index = {pair: place for place, pair in enumerate(pairs)}
         device = cameras.intrinsics.device
         rows, views = torch.tensor(pairs, device=device).unbind(1)
-        self.center = cameras.center
-        self.from_pixel = multiply(cameras.rotation.transpose(1, 2), inverse_3x3(cameras.intrinsics))
+        self.from_pixel = cameras.world_from_pixel
         solids = plan.tables
         linear, offset = solids.linear[rows], cameras.center[views] - solids.center[rows]
         depth = (-(offset * cameras.rotation[views, 2]).sum(-1)).clamp_min(near)

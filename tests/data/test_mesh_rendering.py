@@ -1,8 +1,6 @@
 """Pictures of meshes against exact rays, a second way of casting them, and shadows that are known."""
 
-import os
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,10 +11,10 @@ from lsmgeo import cameras, scenes
 from lsmgeo.data import Mesh, from_trimesh, load_mesh, normalise, render_mesh
 from lsmgeo.data.ray_casting import EmbreeCaster, NumpyCaster
 from lsmgeo.errors import BackendError, CameraError, DTypeError, OptionError, ShapeError
+from tests.data.real_meshes import folder_of_meshes, needs_meshes
 from tests.tolerances import TERMWISE, length_error
 
 pytest.importorskip("embreex")
-ROOT = os.environ.get("LSMGEO_TEST_DATA")
 F32, F64 = torch.float32, torch.float64
 
 
@@ -356,15 +354,10 @@ def test_options_are_checked():
         render_mesh(mesh, many._replace(cam_from_world=2 * many.cam_from_world), light)
 
 
-@pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of meshes")
+@needs_meshes
 def test_154_meshes_are_rendered():
-    folder = Path(ROOT or "") / "meshes_cc0"
-    if not folder.is_dir():
-        pytest.skip("LSMGEO_TEST_DATA holds no meshes_cc0")
-    paths = sorted(folder.glob("*.ply"))
-    assert len(paths) == 154
     many = views(2, 64)
-    for path in paths:
+    for path in sorted(folder_of_meshes().glob("*.ply")):
         mesh = normalise(load_mesh(path))
         picture = render_mesh(mesh, many, sun((0.3, 1, 0.2)))
         assert (picture.mask.float().mean((1, 2)) > 0.01).all(), path.name

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +13,8 @@ from lsmgeo.data import Mesh, from_trimesh, load_mesh, normalise
 from lsmgeo.data.mesh_topology import corner_normals
 from lsmgeo.errors import DataError, DTypeError, OptionError, ShapeError
 from tests.data import mesh_writers as writers
+from tests.data.real_meshes import folder_of_meshes, needs_meshes
 from tests.tolerances import TERMWISE
-
-ROOT = os.environ.get("LSMGEO_TEST_DATA")
 
 
 def load(tmp_path, name, content, **options):
@@ -186,11 +184,9 @@ def test_normals_are_smooth_on_a_sphere_and_sharp_on_a_box():
     np.testing.assert_allclose(normals[~side], np.repeat(can.face_normals[~side][:, None], 3, 1), atol=1e-12)
 
 
-@pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of meshes")
+@needs_meshes
 def test_154_meshes_are_read_as_trimesh_reads_them():
-    folder = Path(ROOT or "") / "meshes_cc0"
-    if not folder.is_dir():
-        pytest.skip("LSMGEO_TEST_DATA holds no meshes_cc0")
+    folder = folder_of_meshes()
     rows = list(csv.DictReader((folder / "index.csv").read_text().splitlines()))
     assert len(rows) == 154
     for row in rows:

@@ -1,8 +1,6 @@
 """Solid voxels against exact occupancy that does not know the mesh, and what becomes of meshes with faults."""
 
-import os
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,8 +16,8 @@ from lsmgeo.data.scan_conversion import LINES, cells_touched, crossings
 from lsmgeo.data.voxelise import plan_voxels, winding_number
 from lsmgeo.errors import BackendError, DTypeError, GridError, OptionError
 from lsmgeo.scenes.meshing import to_mesh
+from tests.data.real_meshes import folder_of_meshes, needs_meshes
 
-ROOT = os.environ.get("LSMGEO_TEST_DATA")
 STRICT = ("winding", "parity", "escape")
 
 
@@ -333,14 +331,9 @@ def test_options_are_checked():
     assert not voxelise(mesh, lower=5.0, upper=6.0).any()  # all of it elsewhere
 
 
-@pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of meshes")
+@needs_meshes
 def test_154_meshes_have_voxels():
-    folder = Path(ROOT or "") / "meshes_cc0"
-    if not folder.is_dir():
-        pytest.skip("LSMGEO_TEST_DATA holds no meshes_cc0")
-    paths = sorted(folder.glob("*.ply"))
-    assert len(paths) == 154
-    for path in paths:
+    for path in sorted(folder_of_meshes().glob("*.ply")):
         mesh = normalise(load_mesh(path))
         solid = voxelise(mesh, keep_thin=True).numpy()
         low, high = mesh.bounds

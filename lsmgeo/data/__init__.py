@@ -1,14 +1,16 @@
 """Posed photographs from files, and shards of shapes to train on: one typed sample, whatever the format."""
 
 from lsmgeo.data.colmap import read_colmap
-from lsmgeo.data.detect import open_scene
+from lsmgeo.data.depth_files import DepthFile, DepthPng
+from lsmgeo.data.detect import FORMATS, Format, detect, open_scene
 from lsmgeo.data.files import atomic_file, read_image, write_atomic, write_point_cloud
+from lsmgeo.data.lenses import Lens
 from lsmgeo.data.loading import EpochSampler, ShapeDataset
 from lsmgeo.data.members import encode_sample
 from lsmgeo.data.mesh_rendering import render_mesh
 from lsmgeo.data.meshes import Mesh, from_trimesh, load_mesh, normalise
 from lsmgeo.data.middlebury import read_middlebury
-from lsmgeo.data.posed import Observations, PosedImages, SparsePoints
+from lsmgeo.data.posed import Observations, PosedImages, SparsePoints, Voxels
 from lsmgeo.data.render_set import Made, render_set
 from lsmgeo.data.sample import Batch, Sample, check_sample, collate
 from lsmgeo.data.shard_reading import ShardSet
@@ -19,8 +21,13 @@ from lsmgeo.data.voxelise import voxelise
 open = open_scene
 
 __all__ = [
+    "FORMATS",
     "Batch",
+    "DepthFile",
+    "DepthPng",
     "EpochSampler",
+    "Format",
+    "Lens",
     "Made",
     "Mesh",
     "Observations",
@@ -30,9 +37,11 @@ __all__ = [
     "ShapeDataset",
     "ShardSet",
     "SparsePoints",
+    "Voxels",
     "atomic_file",
     "check_sample",
     "collate",
+    "detect",
     "encode_sample",
     "from_trimesh",
     "hash_settings",

@@ -1,48 +1,95 @@
-"""Which reader a folder needs, told from what lies in it."""
+"""Which reader a file or a folder needs, told from what it holds."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from lsmgeo.data.colmap import model_folder, read_colmap
 from lsmgeo.data.middlebury import parameter_files, read_middlebury
 from lsmgeo.data.posed import PosedImages
 from lsmgeo.errors import DataError
 
-__all__ = ["open_scene"]
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["FORMATS", "Format", "detect", "open_scene"]
+
+
+class Format(NamedTuple):
+    """A format that can be told from a path.
+
+    Attributes:
+        name: what `PosedImages.source` says.
+        kind: what it holds: posed photographs, voxels alone, or the calibration of cameras.
+        needs: what a folder of it holds, for the message when nothing is found.
+        is_here: whether a path, file or folder, is of this format. Looks at names and, where these do not decide, at
+            the beginning of a file; never raises anything but OSError and DataError.
+        read: reads it.
+    """
+
+    name: str
+    kind: Literal["photographs", "voxels", "calibration"]
+    needs: str
+    is_here: Callable[[Path], bool]
+    read: Callable[[Path], Any]
+
+
+def _is_middlebury(path: Path) -> bool:
+    return path.name.endswith("_par.txt") if path.is_file() else bool(parameter_files(path))
+
+
+def _is_colmap(path: Path) -> bool:
+    return path.is_dir() and model_folder(path) is not None
+
+
+FORMATS = (
+    Format("middlebury", "photographs", "a Middlebury *_par.txt", _is_middlebury, read_middlebury),
+    Format("colmap", "photographs", "a COLMAP model (cameras and images, .bin or .txt)", _is_colmap, read_colmap),
+)
+
+
+def detect(path: str | Path) -> Format:
+    """Tell the format from what a folder holds, or from a file.
+
+    Raises:
+        DataError: there is no such path, or it is of no known format or of several.
+    """
+    path = Path(path)
+    try:
+        if not path.is_file() and not path.is_dir():
+            raise DataError(path, "no such file or folder")
+        found = [candidate for candidate in FORMATS if candidate.is_here(path)]
+    except (OSError, ValueError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(path, f"cannot be read ({error})") from error
+    if len(found) > 1:
+        several = " and ".join(candidate.needs for candidate in found)
+        raise DataError(path, f"holds {several}; name the one file or folder that is meant")
+    if not found:
+        needs = ", ".join(candidate.needs for candidate in FORMATS)
+        raise DataError(path, f"holds nothing that can be read: none of {needs}")
+    return found[0]
 
 
 def open_scene(path: str | Path) -> PosedImages:
-    """Open a folder of posed photographs; the format is told from the files that it holds.
-
-    A folder with a ``*_par.txt`` is a Middlebury multi-view scene; one with ``cameras`` and ``images`` (``.bin`` or
-    ``.txt``, also in ``sparse`` or ``sparse/0``) is a COLMAP reconstruction.
+    """Open posed photographs; the format is told from the files that a folder holds, or from the file named.
 
     Convention:
         Whatever the source's, the cameras come world-to-camera, OpenCV axes, integer pixel centres.
 
     Args:
-        path: the scene's folder, or a ``*_par.txt`` file.
+        path: the scene's folder; or its file of cameras, where a folder holds several.
+
+    Returns:
+        The photographs with cameras, and the points, depth and voxels that the source has.
 
     Raises:
-        DataError: there is no such folder, it holds neither format or both, or its reader refuses it.
+        DataError: there is no such path, it is of no known format or of several, or its reader refuses it.
     """
-    path = Path(path)
-    try:
-        if path.is_file() and path.name.endswith("_par.txt"):
-            return read_middlebury(path)
-        if not path.is_dir():
-            raise DataError(path, "no such folder")
-        is_middlebury = bool(parameter_files(path))
-        is_colmap = model_folder(path) is not None
-    except (OSError, ValueError) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(path, f"cannot be read ({error})") from error
-    if is_middlebury and is_colmap:
-        raise DataError(path, "holds a COLMAP model and a *_par.txt; name the *_par.txt or the model's folder")
-    if is_middlebury:
-        return read_middlebury(path)
-    if is_colmap:
-        return read_colmap(path)
-    raise DataError(path, "holds neither a Middlebury *_par.txt nor a COLMAP model (cameras and images, .bin or .txt)")
+    found = detect(path)
+    if found.kind != "photographs":
+        raise DataError(path, f"holds {found.needs}, no posed photographs")
+    scene: PosedImages = found.read(Path(path))
+    return scene

@@ -32,6 +32,7 @@ __all__ = [
     "parse_floats",
     "parse_ints",
     "read_bytes",
+    "read_cut_out",
     "read_image",
     "read_text",
     "write_atomic",
@@ -162,13 +163,33 @@ def read_image(path: Path, size: tuple[int, int] | None = None, max_pixels: int 
         DataError: not a PNG or JPEG, another size than expected, too large, or damaged.
     """
     with _open_image(path, max_pixels) as image:
-        width, height = image.size
-        if size is not None and (height, width) != tuple(size):
-            reason = f"is {width} x {height} pixels (width x height); its camera expects {size[1]} x {size[0]}"
-            raise DataError(path, reason)
-        if image.mode not in ("1", "L", "LA", "P", "RGB", "RGBA", "CMYK"):
-            raise DataError(path, f"has mode {image.mode}; expected an 8-bit picture")
+        _refuse_size(image, size, path)
+        _refuse_deep(image, path)
         return np.array(image.convert("RGB"))
+
+
+def read_cut_out(path: Path, size: tuple[int, int] | None = None, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Read a PNG or JPEG as 8-bit RGBA, alpha 255 where it has none; otherwise as `read_image`.
+
+    Returns:
+        (H, W, 4) uint8, not premultiplied.
+    """
+    with _open_image(path, max_pixels) as image:
+        _refuse_size(image, size, path)
+        _refuse_deep(image, path)
+        return np.array(image.convert("RGBA"))
+
+
+def _refuse_size(image: Image.Image, size: tuple[int, int] | None, path: Path) -> None:
+    width, height = image.size
+    if size is not None and (height, width) != tuple(size):
+        reason = f"is {width} x {height} pixels (width x height); its camera expects {size[1]} x {size[0]}"
+        raise DataError(path, reason)
+
+
+def _refuse_deep(image: Image.Image, path: Path) -> None:
+    if image.mode not in ("1", "L", "LA", "P", "RGB", "RGBA", "CMYK"):
+        raise DataError(path, f"has mode {image.mode}; expected an 8-bit picture")
 
 
 @contextlib.contextmanager

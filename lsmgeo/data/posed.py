@@ -1,4 +1,4 @@
-"""The one sample type of all readers: photographs with cameras, and the sparse points that came with them."""
+"""What all readers give: photographs with cameras, and the points, depth and voxels that came with them."""
 
 from __future__ import annotations
 
@@ -9,17 +9,20 @@ import numpy as np
 import torch
 
 from lsmgeo._checks import describe
-from lsmgeo.data.files import read_image
+from lsmgeo.data.files import read_cut_out, read_image
 from lsmgeo.data.sample import Sample
-from lsmgeo.errors import OptionError, ShapeError
+from lsmgeo.errors import DataError, OptionError, ShapeError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
     from lsmgeo.cameras import CameraTensors
+    from lsmgeo.data.depth_files import DepthFile
+    from lsmgeo.data.lenses import Lens
+    from lsmgeo.grids import VoxelGrid
 
-__all__ = ["Observations", "PosedImages", "SparsePoints"]
+__all__ = ["Observations", "PosedImages", "SparsePoints", "Voxels"]
 
 
 class Observations(NamedTuple):
@@ -41,19 +44,31 @@ class SparsePoints(NamedTuple):
     observations: tuple[Observations, ...]  # one per photograph
 
 
+class Voxels(NamedTuple):
+    """The solid that the photographs show, as voxels, and where in their world these lie."""
+
+    occupancy: torch.Tensor  # (D, H, W) bool
+    grid: VoxelGrid
+
+
 @dataclass(frozen=True, eq=False)
 class PosedImages:
-    """V photographs with known cameras.
+    """V photographs with known cameras; they may be of different sizes.
 
     Convention:
         Cameras are world-to-camera, OpenCV axes, integer pixel centres, float64, whatever the source's convention.
+        They belong to what :meth:`load` gives: photographs taken through a lens with distortion are straightened.
 
     Attributes:
         names: the names that the source gives to the photographs.
         paths: their files, all inside the scene's folder.
         cameras: :class:`lsmgeo.cameras.CameraTensors` with leading shape (V,).
         points: sparse points where the source has them.
-        source: "middlebury" or "colmap".
+        source: the name of the format, as `lsmgeo.data.detect` gives it.
+        lenses: the lens of each photograph, None for one that is straight; None where all are.
+        depths: the depth of each photograph, None for one without; None where no photograph has any.
+        voxels: the solid that is seen, where the source has it.
+        cut_out: whether the photographs' alpha is the outline of the object, which :meth:`load` puts before white.
     """
 
     names: tuple[str, ...]
@@ -61,6 +76,10 @@ class PosedImages:
     cameras: CameraTensors
     points: SparsePoints | None
     source: str
+    lenses: tuple[Lens | None, ...] | None = None
+    depths: tuple[DepthFile | None, ...] | None = None
+    voxels: Voxels | None = None
+    cut_out: bool = False
 
     def __len__(self) -> int:
         return len(self.names)
@@ -75,7 +94,7 @@ class PosedImages:
         return height, width
 
     def load(self, view: int) -> torch.Tensor:
-        """Read one photograph.
+        """Read one photograph, straightened, before white where it is cut out.
 
         Returns:
             (3, H, W) float32 in [0, 1], RGB.
@@ -83,24 +102,64 @@ class PosedImages:
         Raises:
             DataError: the file is missing, damaged, or not of its camera's size.
         """
-        pixels = read_image(self.paths[view], self.size(view))
+        if self.cut_out:
+            pixels = self._straight(view, read_cut_out(self.paths[view], self.size(view)))
+            alpha = pixels[..., 3:].astype(np.float32) / 255
+            mixed = pixels[..., :3] * alpha + 255 * (1 - alpha)
+            return torch.from_numpy(mixed).permute(2, 0, 1).div_(255)
+        pixels = self._straight(view, read_image(self.paths[view], self.size(view)))
         # In place: a photograph of many megapixels is not held twice as floats.
         return torch.from_numpy(pixels).permute(2, 0, 1).to(torch.float32).div_(255)
 
+    def load_mask(self, view: int) -> torch.Tensor | None:
+        """Read the outline of the object in one photograph: where alpha is at least one half.
+
+        Returns:
+            (H, W) bool, or None where photographs are not cut out.
+
+        Raises:
+            DataError: as :meth:`load`.
+        """
+        if not self.cut_out:
+            return None
+        pixels = self._straight(view, read_cut_out(self.paths[view], self.size(view)))
+        return torch.from_numpy(pixels[..., 3] >= 128)
+
+    def load_depth(self, view: int) -> torch.Tensor | None:
+        """Read the depth of one photograph.
+
+        Returns:
+            (H, W) float32 camera z in world units, 0 where there is none; None where this photograph has no depth.
+
+        Raises:
+            DataError: the file is missing, damaged, or not of its camera's size.
+        """
+        file = None if self.depths is None else self.depths[view]
+        if file is None:
+            return None
+        return torch.from_numpy(self._straight(view, file.read(self.size(view)), nearest=True))
+
+    def _straight(self, view: int, picture: np.ndarray, *, nearest: bool = False) -> np.ndarray:
+        lens = None if self.lenses is None else self.lenses[view]
+        return picture if lens is None else lens.straighten(picture, nearest=nearest)
+
     def sample(self, views: Sequence[int] | None = None) -> Sample:
         """Read photographs as the sample that models are fed, named after their folder.
+
+        Where there are voxels, the world is moved and scaled so that they fill [-0.5, 0.5]^3, as a sample promises.
 
         Args:
             views: which, and in which order; None for all. They must be of one size: resize or crop others first
                 (`lsmgeo.cameras.resize`, `lsmgeo.cameras.crop` do the cameras' part).
 
         Returns:
-            Images and cameras (float64); no depth, mask, occupancy, mesh or category.
+            Images and cameras (float64); depth where all the photographs have it, mask and occupancy where the source
+            has them; no mesh, no category.
 
         Raises:
             OptionError: no view, or one that does not exist.
             ShapeError: two photographs of different sizes.
-            DataError: a file is missing, damaged, or not of its camera's size.
+            DataError: a file is missing, damaged, or not of its camera's size; or the voxels fill no cube.
         """
         chosen = list(range(len(self)) if views is None else views)
         whole = all(isinstance(view, int | np.integer) and not isinstance(view, bool) for view in chosen)
@@ -116,6 +175,30 @@ class PosedImages:
             )
         images = torch.stack([self.load(view) for view in chosen])
         cameras = type(self.cameras)(*(torch.as_tensor(value)[chosen] for value in self.cameras))
+        maps = [depth for view in chosen if (depth := self.load_depth(view)) is not None]
+        depth = torch.stack(maps) if len(maps) == len(chosen) else None
+        masks = [mask for view in chosen if (mask := self.load_mask(view)) is not None]
+        occupancy = None
+        if self.voxels is not None:
+            occupancy = self.voxels.occupancy
+            unit, middle = self._cube(self.voxels.grid)
+            # X = unit X' + middle, and the camera's own coordinates shrink alike, so that its rotation stays one.
+            E = cameras.cam_from_world.clone()
+            E[:, :3, 3] = (E[:, :3, 3] + (E[:, :3, :3] * middle).sum(-1)) / unit
+            cameras = cameras._replace(cam_from_world=E)
+            depth = None if depth is None else depth / unit
         folder = self.paths[chosen[0]].parent
-        name = folder.parent.name if folder.name == "images" else folder.name
-        return Sample(images, cameras, None, None, None, None, None, name or self.source)
+        name = folder.parent.name if folder.name in ("images", "rendering") else folder.name
+        return Sample(
+            images, cameras, depth, torch.stack(masks) if masks else None, occupancy, None, None, name or self.source
+        )
+
+    def _cube(self, grid: VoxelGrid) -> tuple[float, torch.Tensor]:
+        """The side and the middle of the cube that the voxels fill."""
+        index = torch.tensor(grid.shape, dtype=torch.float64)
+        T = grid.world_from_lattice.double()
+        sides = T[:3, :3].diagonal() * index.flip(0)
+        straight = bool(((T[:3, :3] - T[:3, :3].diagonal().diag()).abs() <= 1e-9 * sides.abs().max()).all())
+        if not straight or not bool((sides - sides[0]).abs().max() <= 1e-6 * sides[0]):
+            raise DataError(self.paths[0].parent, "its voxels fill no cube along the axes, which a sample needs")
+        return float(sides[0]), T[:3, 3] + T[:3, :3].diagonal() * (index.flip(0) - 1) / 2

@@ -99,7 +99,7 @@ def test_the_installed_command_has_these_statuses(tmp_path):
     command = [sys.executable, "-c", code, "reconstruct", "/nonexistent"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "lsmgeo: error: /nonexistent: no such folder\n"
+    assert done.stderr == "lsmgeo: error: /nonexistent: no such file or folder\n"
     assert list(tmp_path.iterdir()) == []
 
 

@@ -154,7 +154,7 @@ def test_an_interrupt_leaves_no_file(scene, tmp_path, monkeypatch, capsys, place
 
 def test_a_missing_scene_gives_one_line_and_status_2(tmp_path, capsys):
     assert cli.main(["reconstruct", str(tmp_path / "nowhere")]) == 2
-    assert capsys.readouterr().err == f"lsmgeo: error: {tmp_path / 'nowhere'}: no such folder\n"
+    assert capsys.readouterr().err == f"lsmgeo: error: {tmp_path / 'nowhere'}: no such file or folder\n"
 
 
 def test_two_photographs_are_too_few(scene, tmp_path, capsys):

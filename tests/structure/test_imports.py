@@ -37,9 +37,9 @@ MAY_IMPORT = {
     "fusion": SHARED | {"functional", "kernels"},
     "rays": SHARED | {"functional", "grids", "kernels", "_sites"},
 }
-OUTSIDE_THE_CORE = {"models", "data", "classical", "scenes", "metrics", "cli", "demo"}
+OUTSIDE_THE_CORE = {"models", "data", "classical", "scenes", "metrics", "cli", "demo", "diagnosis"}
 # What the parts outside may import of each other; the core is open to all of them.
-MAY_ALSO_IMPORT = {"scenes": set(), "data": {"scenes"}, "metrics": set()}
+MAY_ALSO_IMPORT = {"scenes": set(), "data": {"scenes"}, "metrics": set(), "diagnosis": {"data"}}
 HEAVY = {"cv2", "trimesh", "skimage", "matplotlib", "jsonargparse", "triton", "scipy", "tqdm", "PIL"}
 
 

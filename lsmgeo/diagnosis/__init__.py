@@ -1,0 +1,5 @@
+"""Whether cameras, photographs, depth and voxels belong together, and which mistake explains it where they do not."""
+
+from lsmgeo.diagnosis.findings import Cause, Check, Findings
+
+__all__ = ["Cause", "Check", "Findings"]

@@ -15,7 +15,7 @@ class Check(NamedTuple):
         value: the median, or the fraction.
         unit: "px", "%", "grey levels" or "".
         limit: what the value must not exceed, or with ``at_least`` not fall below.
-        count: number of single measurements behind the value.
+        measured: number of single measurements behind the value.
         of: what these are, such as "matches".
         at_least: whether large values are good.
     """
@@ -24,7 +24,7 @@ class Check(NamedTuple):
     value: float
     unit: str
     limit: float
-    count: int
+    measured: int
     of: str
     at_least: bool = False
 

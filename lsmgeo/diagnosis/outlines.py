@@ -12,7 +12,7 @@ LEAST_CLEARANCE = 1.3
 
 
 def outline(mask: np.ndarray) -> np.ndarray | None:
-    """The convex hull of an object's pixels, borders of pixels included.
+    """The convex hull of the centres of an object's pixels.
 
     Args:
         mask: (H, W) bool, True on the object.
@@ -26,10 +26,8 @@ def outline(mask: np.ndarray) -> np.ndarray | None:
     rows, columns = np.nonzero(mask)
     if len(rows) == 0 or mask[[0, -1]].any() or mask[:, [0, -1]].any():
         return None
-    hull = cv2.convexHull(np.stack([columns, rows], 1).astype(np.int32))[:, 0].astype(np.float64)
-    corners = hull[:, None] + np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])
-    # A border lies half a pixel beyond the last pixel's centre only on average; the corners would be a full diagonal.
-    return np.asarray(cv2.convexHull(corners.reshape(-1, 2).astype(np.float32))[:, 0], np.float64)
+    # Of pixels' centres: the half pixel up to the border is the same in both views, and shifts no tangent against another.
+    return cv2.convexHull(np.stack([columns, rows], 1).astype(np.int32))[:, 0].astype(np.float64)
 
 
 def epipolar_tangency(

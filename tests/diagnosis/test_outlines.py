@@ -119,7 +119,7 @@ def test_an_outline_is_the_hull_of_the_pixels():
     mask[5:9, 7:12] = True
     mask[6, 8] = False
     points = outline(mask)
-    assert points.min(0).tolist() == [6.5, 4.5]
-    assert points.max(0).tolist() == [11.5, 8.5]
+    assert points.min(0).tolist() == [7, 5]
+    assert points.max(0).tolist() == [11, 8]
     mask[0, 3] = True
     assert outline(mask) is None  # it leaves the picture

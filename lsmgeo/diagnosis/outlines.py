@@ -26,7 +26,7 @@ def outline(mask: np.ndarray) -> np.ndarray | None:
     rows, columns = np.nonzero(mask)
     if len(rows) == 0 or mask[[0, -1]].any() or mask[:, [0, -1]].any():
         return None
-    # Through pixels' centres: the half pixel up to the border is there in both views, and moves no plane against another.
+    # Through pixels' centres: the half pixel up to the border is there in both views, and moves no plane.
     return cv2.convexHull(np.stack([columns, rows], 1).astype(np.int32))[:, 0].astype(np.float64)
 
 

@@ -11,11 +11,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from lsmgeo import cli, data
 from lsmgeo.cameras import CameraTensors, from_opencv, from_opengl
 from lsmgeo.classical import reconstruct_view
 from lsmgeo.functional import sample_views
+from tests.data.test_stereo_pairs import write_pair
 
 ROOT = os.environ.get("LSMGEO_TEST_DATA")
 pytestmark = pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of real photographs")
@@ -123,16 +125,11 @@ def test_colmap_reprojection_error():
     [("00005.png", "00010.png"), ("00010.png", "00015.png"), ("00055.png", "00060.png"), ("00090.png", "00095.png")],
 )
 def test_hololens_depth_of_one_frame_is_that_of_another(first, second):
-    path = folder("hololens_rgbd")
-    K = torch.from_numpy(np.loadtxt(path / "K.txt"))
-    rows = (path / "frame_index.txt").read_text().split()
-    poses = np.loadtxt(path / "poses.txt").reshape(-1, 4, 4)
-    world_from_cam = [torch.from_numpy(poses[rows.index(name)]) for name in (first, second)]
-    E = torch.stack([torch.linalg.inv(pose) for pose in world_from_cam])
-    files = [str(path / "depth" / name) for name in (first, second)]
-    depths = [torch.from_numpy(cv2.imread(file, cv2.IMREAD_UNCHANGED) / 1000.0) for file in files]
-    height, width = depths[0].shape
-    cameras = from_opencv(K.expand(2, 3, 3), E[:, :3, :3], E[:, :3, 3], height, width)
+    scene = data.open(folder("hololens_rgbd"))
+    assert len(scene) == 29
+    views = [scene.names.index(name) for name in (first, second)]
+    cameras = CameraTensors(*(torch.as_tensor(value)[views] for value in scene.cameras))
+    depths = [scene.load_depth(view).double() for view in views]
     v, u = torch.nonzero(depths[0] > 0, as_tuple=True)
     rays = torch.linalg.solve(cameras.intrinsics[0], torch.stack([u, v, torch.ones_like(u)]).double())
     camera = rays * depths[0][v, u]
@@ -152,6 +149,28 @@ def test_hololens_depth_of_one_frame_is_that_of_another(first, second):
     assert int(both.sum()) > 30_000
     assert float(errors.median()) < 0.003
     assert float((errors < 0.02).double().mean()) > 0.97
+
+
+def test_the_motorcycle_s_right_photograph_becomes_the_left_one(tmp_path):
+    path = folder("middlebury_motorcycle")
+    pictures = [np.asarray(Image.open(path / f"motorcycle_{side}.png").convert("RGB")) for side in ("left", "right")]
+    disparity = np.load(path / "motorcycle_disp.npz")["arr_0"].astype(np.float32)
+    numbers = (994.978, 311.193, 254.877, 31.086, 193.001)
+    written, _ = write_pair(tmp_path, pictures, [disparity, None], numbers)
+    scene = data.open(written)
+    depth = scene.load_depth(0).double()
+    K, E = scene.cameras.intrinsics, scene.cameras.cam_from_world
+    v, u = torch.nonzero(depth > 0, as_tuple=True)
+    assert len(u) == np.isfinite(disparity).sum()
+    rays = torch.linalg.solve(K[0], torch.stack([u, v, torch.ones_like(u)]).double())
+    moved = K[1] @ (E[1, :3, :3] @ (rays * depth[v, u]) + E[1, :3, 3:])
+    pixels = np.full((*depth.shape, 2), -1, np.float32)
+    pixels[v, u] = (moved[:2] / moved[2]).T.numpy()
+    inside = pixels[..., 0] >= 0
+    left, right = (scene.load(view).permute(1, 2, 0).numpy() * 255 for view in (0, 1))
+    warped = cv2.remap(right, pixels, None, cv2.INTER_LINEAR)
+    assert np.median(np.abs(warped - left)[inside]) < 3.05
+    assert np.median(np.abs(right - left)[inside]) > 20
 
 
 def test_colmap_depth_error_at_its_own_points():

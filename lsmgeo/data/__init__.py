@@ -1,10 +1,12 @@
 """Posed photographs from files, and shards of shapes to train on: one typed sample, whatever the format."""
 
+from lsmgeo.data.cameras_json import read_cameras_json
 from lsmgeo.data.colmap import read_colmap
 from lsmgeo.data.depth_files import DepthFile, DepthPng
 from lsmgeo.data.detect import FORMATS, Format, detect, open_scene
 from lsmgeo.data.files import atomic_file, read_image, write_atomic, write_point_cloud
 from lsmgeo.data.lenses import Lens
+from lsmgeo.data.llff import read_llff
 from lsmgeo.data.loading import EpochSampler, ShapeDataset
 from lsmgeo.data.members import encode_sample
 from lsmgeo.data.mesh_rendering import render_mesh
@@ -12,10 +14,15 @@ from lsmgeo.data.meshes import Mesh, from_trimesh, load_mesh, normalise
 from lsmgeo.data.middlebury import read_middlebury
 from lsmgeo.data.posed import Observations, PosedImages, SparsePoints, Voxels
 from lsmgeo.data.render_set import Made, render_set
+from lsmgeo.data.rgbd import read_rgbd
 from lsmgeo.data.sample import Batch, Sample, check_sample, collate
+from lsmgeo.data.seven_scenes import read_seven_scenes
 from lsmgeo.data.shard_reading import ShardSet
 from lsmgeo.data.shards import hash_settings, verify_shard, write_shard
 from lsmgeo.data.sources import Recipe
+from lsmgeo.data.stereo_pairs import Disparity, read_stereo_pair
+from lsmgeo.data.strecha import read_strecha
+from lsmgeo.data.transforms_json import read_transforms
 from lsmgeo.data.voxelise import voxelise
 
 open = open_scene
@@ -25,6 +32,7 @@ __all__ = [
     "Batch",
     "DepthFile",
     "DepthPng",
+    "Disparity",
     "EpochSampler",
     "Format",
     "Lens",
@@ -49,9 +57,16 @@ __all__ = [
     "normalise",
     "open",
     "open_scene",
+    "read_cameras_json",
     "read_colmap",
     "read_image",
+    "read_llff",
     "read_middlebury",
+    "read_rgbd",
+    "read_seven_scenes",
+    "read_stereo_pair",
+    "read_strecha",
+    "read_transforms",
     "render_mesh",
     "render_set",
     "verify_shard",

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from lsmgeo.cameras import from_colmap
 from lsmgeo.data import colmap_binary, colmap_text
-from lsmgeo.data.colmap_model import ColmapModel
+from lsmgeo.data.assembling import as_data_error, assemble
 from lsmgeo.data.files import child
 from lsmgeo.data.posed import Observations, PosedImages, SparsePoints
-from lsmgeo.errors import DataError, LsmGeoError
+from lsmgeo.errors import DataError
+
+if TYPE_CHECKING:
+    from lsmgeo.data.colmap_model import ColmapImage, ColmapModel
+    from lsmgeo.data.lenses import Lens
 
 __all__ = ["model_folder", "read_colmap"]
 
@@ -27,15 +32,16 @@ def model_folder(path: Path) -> tuple[Path, str] | None:
 
 
 def read_colmap(path: str | Path, images: str | Path | None = None) -> PosedImages:
-    """Read a COLMAP model of undistorted photographs.
+    """Read a COLMAP model; photographs with distortion are straightened.
 
     The model (``cameras``, ``images`` and, where it exists, ``points3D``, binary or text) is looked for in the folder,
     in ``sparse`` and in ``sparse/0``; the photographs in ``images`` beside it, else in the folder itself. Photographs
-    are ordered by name.
+    are ordered by name. Its files of rigs and frames repeat the photographs' poses and are not read.
 
     Convention:
         COLMAP's poses are world-to-camera with OpenCV axes, as ours. Its pixel centres are half-integer: principal
-        points and observations lose 0.5.
+        points and observations lose 0.5. The models that OpenCV has become a `Lens`, and observations move to where
+        the straightened photograph shows them; one that it cannot show is left out.
 
     Args:
         path: the scene's folder or the model's.
@@ -45,7 +51,7 @@ def read_colmap(path: str | Path, images: str | Path | None = None) -> PosedImag
         The photographs with cameras and sparse points.
 
     Raises:
-        DataError: no model, a damaged or inconsistent one, a camera model with distortion, or a name that leads
+        DataError: no model, a damaged or inconsistent one, a camera model that OpenCV lacks, or a name that leads
             outside the folder of photographs.
     """
     path = Path(path)
@@ -60,6 +66,7 @@ def read_colmap(path: str | Path, images: str | Path | None = None) -> PosedImag
     entries = sorted(model.images, key=lambda entry: entry.name)
     root = Path(images) if images is not None else _image_folder(path, folder)
 
+    lenses = {camera_id: camera.lens() for camera_id, camera in model.cameras.items()}
     paths, used = [], []
     for entry in entries:
         camera = model.cameras.get(entry.camera_id)
@@ -67,9 +74,7 @@ def read_colmap(path: str | Path, images: str | Path | None = None) -> PosedImag
             raise DataError(file, f"{entry.name!r} refers to camera {entry.camera_id}, which does not exist")
         paths.append(child(root, entry.name, file))
         used.append(camera)
-    if len({entry.name for entry in entries}) != len(entries):
-        raise DataError(file, "names a photograph twice")
-    try:
+    with as_data_error(file):
         cameras = from_colmap(
             torch.from_numpy(np.stack([camera.intrinsics() for camera in used])),
             torch.from_numpy(np.stack([entry.quaternion for entry in entries])),
@@ -77,10 +82,16 @@ def read_colmap(path: str | Path, images: str | Path | None = None) -> PosedImag
             torch.tensor([camera.height for camera in used]),
             torch.tensor([camera.width for camera in used]),
         )
-    except LsmGeoError as error:
-        raise DataError(file, str(error)) from error
-    points = _sparse_points(model, [entry.image_id for entry in entries], file)
-    return PosedImages(tuple(entry.name for entry in entries), tuple(paths), cameras, points, "colmap")
+        points = _sparse_points(model, entries, lenses, file)
+    return assemble(
+        [entry.name for entry in entries],
+        paths,
+        cameras,
+        "colmap",
+        file=file,
+        lenses=[lenses[entry.camera_id] for entry in entries],
+        points=points,
+    )
 
 
 def _image_folder(path: Path, model: Path) -> Path:
@@ -90,16 +101,16 @@ def _image_folder(path: Path, model: Path) -> Path:
     return path
 
 
-def _sparse_points(model: ColmapModel, order: list[int], file: Path) -> SparsePoints | None:
+def _sparse_points(
+    model: ColmapModel, entries: list[ColmapImage], lenses: dict[int, Lens | None], file: Path
+) -> SparsePoints | None:
     if model.points is None:
         return None
     identifiers, positions, colours = model.points
-    by_id = {entry.image_id: entry for entry in model.images}
     ranks = np.argsort(identifiers, kind="stable")
     ordered = identifiers[ranks]
     observations = []
-    for image_id in order:
-        entry = by_id[image_id]
+    for entry in entries:
         known = entry.point_ids != -1
         slots = np.searchsorted(ordered, entry.point_ids[known])
         if len(ordered) == 0 and known.any():
@@ -107,5 +118,10 @@ def _sparse_points(model: ColmapModel, order: list[int], file: Path) -> SparsePo
         slots = np.minimum(slots, max(len(ordered) - 1, 0))
         if (ordered[slots] != entry.point_ids[known]).any():
             raise DataError(file, f"{entry.name!r} observes a point that does not exist")
-        observations.append(Observations(ranks[slots], entry.pixels[known] - 0.5))
+        pixels = entry.pixels[known] - 0.5
+        lens = lenses[entry.camera_id]
+        if lens is not None:
+            pixels = lens.straighten_pixels(pixels)
+        shown = np.isfinite(pixels).all(1)
+        observations.append(Observations(ranks[slots][shown], pixels[shown]))
     return SparsePoints(positions, colours, tuple(observations))

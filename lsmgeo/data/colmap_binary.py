@@ -16,7 +16,7 @@ from lsmgeo.data.colmap_model import (
     ColmapModel,
     check_model,
     check_points,
-    refuse_distortion,
+    refuse_model,
 )
 from lsmgeo.data.files import read_bytes
 from lsmgeo.errors import DataError
@@ -97,11 +97,12 @@ def _read_cameras(path: Path) -> dict[int, ColmapCamera]:
     for _ in range(cursor.count(head.size + 24)):
         camera_id, model, width, height = cursor.take(head)
         if model not in CAMERA_MODELS:
-            raise refuse_distortion(model, path)
+            raise refuse_model(model, path)
         if camera_id in cameras:
             raise DataError(path, f"uses camera id {camera_id} twice")
-        parameters = cursor.take(struct.Struct(f"<{CAMERA_MODELS[model][1]}d"))
-        cameras[camera_id] = ColmapCamera(width, height, parameters)
+        name, number = CAMERA_MODELS[model]
+        parameters = cursor.take(struct.Struct(f"<{number}d"))
+        cameras[camera_id] = ColmapCamera(name, width, height, parameters)
     cursor.finish()
     return cameras
 

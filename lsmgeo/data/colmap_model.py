@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from lsmgeo.data.lenses import Lens
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
@@ -21,40 +22,73 @@ __all__ = [
     "ColmapModel",
     "check_model",
     "check_points",
-    "refuse_distortion",
+    "refuse_model",
 ]
 
 MAX_CAMERA_BYTES = 1 << 24
 MAX_MODEL_BYTES = 1 << 31
 
-# Binary id -> (name, number of parameters). The others have distortion and are named only to be refused clearly.
-CAMERA_MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4)}
-DISTORTED_MODELS = {
-    2: "SIMPLE_RADIAL",
-    3: "RADIAL",
-    4: "OPENCV",
-    5: "OPENCV_FISHEYE",
-    6: "FULL_OPENCV",
+# Binary id -> (name, number of parameters), as COLMAP numbers them.
+CAMERA_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+}
+# Models that OpenCV does not have, named only to be refused clearly.
+OTHER_MODELS = {
     7: "FOV",
-    8: "SIMPLE_RADIAL_FISHEYE",
-    9: "RADIAL_FISHEYE",
     10: "THIN_PRISM_FISHEYE",
     11: "RAD_TAN_THIN_PRISM_FISHEYE",
+    12: "SIMPLE_DIVISION",
+    13: "DIVISION",
+    16: "EUCM",
+    17: "EQUIRECTANGULAR",
 }
 
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """One camera as COLMAP states it; parameters are f cx cy or fx fy cx cy with half-integer pixel centres."""
+    """One camera as COLMAP states it: f cx cy or fx fy cx cy with half-integer pixel centres, then its distortion."""
 
+    model: str
     width: int
     height: int
     parameters: tuple[float, ...]
 
+    @property
+    def focal_lengths(self) -> tuple[float, float]:
+        """Along x and y."""
+        return self.parameters[0], self.parameters[self._shared]
+
+    @property
+    def _shared(self) -> int:
+        """1 where x and y have focal lengths of their own, 0 where they share one."""
+        return 0 if self.model.startswith(("SIMPLE_", "RADIAL")) else 1
+
     def intrinsics(self) -> np.ndarray:
         """K with COLMAP's own half-integer pixel centres, (3, 3)."""
-        *focal, cx, cy = self.parameters
-        return np.array([[focal[0], 0, cx], [0, focal[-1], cy], [0, 0, 1]], np.float64)
+        (fx, fy), (cx, cy) = self.focal_lengths, self.parameters[self._shared + 1 : self._shared + 3]
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
+
+    def lens(self) -> Lens | None:
+        """What the camera's distortion is to OpenCV; None where there is none."""
+        coefficients = self.parameters[self._shared + 3 :]
+        fisheye = self.model.endswith("FISHEYE")
+        if not fisheye and not any(coefficients):
+            return None
+        K = self.intrinsics()
+        K[:2, 2] -= 0.5
+        # COLMAP's order is OpenCV's, and what its shorter models leave out is zero.
+        whole = coefficients + (0.0,) * (4 - len(coefficients))
+        return Lens("fisheye" if fisheye else "perspective", K, whole, self.height, self.width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +112,14 @@ class ColmapModel(NamedTuple):
     points: tuple[np.ndarray, np.ndarray, np.ndarray] | None
 
 
-def refuse_distortion(model: int | str, path: Path) -> DataError:
-    """The error for a camera model that is not a pinhole."""
-    name = DISTORTED_MODELS.get(model, model) if isinstance(model, int) else model[:40]
-    if name in DISTORTED_MODELS.values():
-        reason = f"camera model {name} has distortion; undistort first (colmap image_undistorter)"
+def refuse_model(model: int | str, path: Path) -> DataError:
+    """The error for a camera model that cannot be straightened here."""
+    name = OTHER_MODELS.get(model, model) if isinstance(model, int) else model[:40]
+    if name in OTHER_MODELS.values():
+        reason = f"camera model {name} is none of OpenCV's; undistort first (colmap image_undistorter)"
     else:
-        reason = f"unknown camera model {name!r}; expected PINHOLE or SIMPLE_PINHOLE"
+        known = ", ".join(known for known, _ in CAMERA_MODELS.values())
+        reason = f"unknown camera model {name!r}; expected one of {known}"
     return DataError(path, reason)
 
 
@@ -99,7 +134,7 @@ def check_model(cameras: dict[int, ColmapCamera], images: list[ColmapImage], fol
         numbers = np.array(camera.parameters)
         if not (0 < camera.width <= 1 << 17 and 0 < camera.height <= 1 << 17):
             raise DataError(path, f"camera {camera_id} has an impossible size {camera.width} x {camera.height}")
-        if not (np.abs(numbers) < 1e7).all() or numbers[:-2].min() <= 0:
+        if not (np.abs(numbers) < 1e7).all() or min(camera.focal_lengths) <= 0:
             raise DataError(path, f"camera {camera_id}: parameters must be finite and focal lengths positive")
     path = folder / f"images.{form}"
     if len({image.image_id for image in images}) != len(images):

@@ -14,7 +14,7 @@ from lsmgeo.data.colmap_model import (
     ColmapModel,
     check_model,
     check_points,
-    refuse_distortion,
+    refuse_model,
 )
 from lsmgeo.data.files import MAX_TEXT_BYTES, parse_floats, parse_ints, read_text
 from lsmgeo.errors import DataError
@@ -54,13 +54,13 @@ def _read_cameras(path: Path) -> dict[int, ColmapCamera]:
         if len(tokens) < 4:
             raise DataError(path, f"{where}: expected id, model, width, height and parameters")
         if tokens[1] not in _MODELS:
-            raise refuse_distortion(tokens[1], path)
+            raise refuse_model(tokens[1], path)
         camera_id, width, height = parse_ints([tokens[0], *tokens[2:4]], path, where)
         if len(tokens) - 4 != _MODELS[tokens[1]]:
             raise DataError(path, f"{where}: {tokens[1]} has {_MODELS[tokens[1]]} parameters; got {len(tokens) - 4}")
         if camera_id in cameras:
             raise DataError(path, f"{where}: camera id {camera_id} is used twice")
-        cameras[camera_id] = ColmapCamera(width, height, tuple(parse_floats(tokens[4:], path, where)))
+        cameras[camera_id] = ColmapCamera(tokens[1], width, height, tuple(parse_floats(tokens[4:], path, where)))
     return cameras
 
 

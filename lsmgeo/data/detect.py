@@ -5,9 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from lsmgeo.data.cameras_json import is_cameras_json, read_cameras_json
 from lsmgeo.data.colmap import model_folder, read_colmap
+from lsmgeo.data.llff import is_llff, read_llff
 from lsmgeo.data.middlebury import parameter_files, read_middlebury
 from lsmgeo.data.posed import PosedImages
+from lsmgeo.data.rgbd import is_rgbd, read_rgbd
+from lsmgeo.data.seven_scenes import is_seven_scenes, read_seven_scenes
+from lsmgeo.data.stereo_pairs import is_stereo_pair, read_stereo_pair
+from lsmgeo.data.strecha import is_strecha, read_strecha
+from lsmgeo.data.transforms_json import is_transforms, read_transforms
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
@@ -46,6 +53,13 @@ def _is_colmap(path: Path) -> bool:
 FORMATS = (
     Format("middlebury", "photographs", "a Middlebury *_par.txt", _is_middlebury, read_middlebury),
     Format("colmap", "photographs", "a COLMAP model (cameras and images, .bin or .txt)", _is_colmap, read_colmap),
+    Format("rgbd", "photographs", "K.txt, poses.txt and frame_index.txt of an RGB-D set", is_rgbd, read_rgbd),
+    Format("7-scenes", "photographs", "frame-*.pose.txt of 7-Scenes", is_seven_scenes, read_seven_scenes),
+    Format("middlebury-stereo", "photographs", "calib.txt and im0.png of a pair", is_stereo_pair, read_stereo_pair),
+    Format("transforms", "photographs", "a transforms.json (or transforms_*.json)", is_transforms, read_transforms),
+    Format("llff", "photographs", "an LLFF poses_bounds.npy", is_llff, read_llff),
+    Format("cameras", "photographs", "a cameras.json of lsmgeo's", is_cameras_json, read_cameras_json),
+    Format("strecha", "photographs", "Strecha's *.camera files", is_strecha, read_strecha),
 )
 
 

@@ -7,7 +7,6 @@ allocated, names stay inside their folder, and every failure is a :class:`lsmgeo
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import tempfile
 import warnings
@@ -28,6 +27,7 @@ __all__ = [
     "AtomicFile",
     "atomic_file",
     "child",
+    "has_alpha",
     "image_size",
     "parse_floats",
     "parse_ints",
@@ -148,6 +148,16 @@ def image_size(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[int, int]:
         return image.size[1], image.size[0]
 
 
+def has_alpha(path: Path) -> bool:
+    """Whether a PNG or JPEG says in its header that it has transparent pixels; none is decoded.
+
+    Raises:
+        DataError: as `image_size`.
+    """
+    with _open_image(path, MAX_PIXELS) as image:
+        return image.mode in ("RGBA", "LA") or "transparency" in image.info
+
+
 def read_image(path: Path, size: tuple[int, int] | None = None, max_pixels: int = MAX_PIXELS) -> np.ndarray:
     """Read a PNG or JPEG photograph as 8-bit RGB.
 
@@ -196,12 +206,18 @@ def _refuse_deep(image: Image.Image, path: Path) -> None:
 def _open_image(path: Path, max_pixels: int) -> Iterator[Image.Image]:
     from PIL import Image
 
-    content = read_bytes(path, 4096 + 8 * max_pixels)
+    limit = 4096 + 8 * max_pixels
     try:
+        # A pipe or a device would block or never end, so only plain files are opened at all.
+        if not path.is_file():
+            raise DataError(path, "no such file")
+        if path.stat().st_size > limit:
+            raise DataError(path, f"is larger than the limit of {limit} bytes")
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             # Sniffing among all of Pillow's formats would reach parsers (EPS, FITS) that run programs or expand files.
-            with Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
+            # The file itself, not its bytes: of hundreds of photographs only the headers are read when a scene opens.
+            with path.open("rb") as stream, Image.open(stream, formats=("PNG", "JPEG")) as image:
                 width, height = image.size
                 if width * height > max_pixels:
                     raise DataError(path, f"has {width} x {height} pixels, the limit is {max_pixels}")

@@ -14,6 +14,9 @@ __all__ = ["Lens"]
 
 # What a camera sees may shrink or grow by so much when it is straightened; beyond, the coefficients are nonsense.
 MOST_ZOOM = 20.0
+# Points along each side of a photograph at which its view is measured, and pixels by which these may miss.
+RIM_STEPS = 65
+RIM_SLACK = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,23 +50,39 @@ class Lens:
         Raises:
             CameraError: the coefficients straighten nothing: no such view exists.
         """
-        import cv2
-
-        size = (self.width, self.height)
-        try:
-            if self.kind == "fisheye":
-                K = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
-                    self.intrinsics, self._bent, size, np.eye(3), balance=0.0
-                )
-            else:
-                K, _ = cv2.getOptimalNewCameraMatrix(self.intrinsics, self._bent, size, 0.0)
-        except cv2.error as error:
-            raise CameraError(f"Lens: the distortion {self.coefficients} cannot be undone") from error
-        K = np.asarray(K, np.float64)
+        rims = [self._rays(rim) for rim in self._rims()]
+        # A ray that the model cannot trace back (NaN) may lie in a corner that the view need not reach.
+        if any(np.isnan(rim[:, 0]).all() for rim in rims):
+            raise CameraError(f"Lens: the distortion {self.coefficients} cannot be undone")
+        left, right = np.nanmax(rims[0][:, 0]), np.nanmin(rims[1][:, 0])
+        top, bottom = np.nanmax(rims[2][:, 1]), np.nanmin(rims[3][:, 1])
+        K = np.eye(3)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            K[[0, 1], [0, 1]] = np.array([self.width - 1, self.height - 1]) / np.array([right - left, bottom - top])
+        K[:2, 2] = -K[0, 0] * left, -K[1, 1] * top
         zoom = K[[0, 1], [0, 1]] / self.intrinsics[[0, 1], [0, 1]]
-        if not (np.isfinite(K).all() and (zoom > 1 / MOST_ZOOM).all() and (zoom < MOST_ZOOM).all()):
-            raise CameraError(f"Lens: the distortion {self.coefficients} leaves no straight picture of {size}")
+        if not ((zoom > 1 / MOST_ZOOM).all() and (zoom < MOST_ZOOM).all() and self._covers(K)):
+            size = f"{self.width} x {self.height}"
+            raise CameraError(f"Lens: the distortion {self.coefficients} leaves no straight picture of {size} pixels")
         return K
+
+    def _rims(self) -> list[np.ndarray]:
+        """Pixel centres (N, 2) along the left, right, top and bottom of a photograph."""
+        x, y = np.linspace(0, self.width - 1, RIM_STEPS), np.linspace(0, self.height - 1, RIM_STEPS)
+        sides = [(np.full_like(y, side), y) for side in (0, self.width - 1)]
+        ends = [(x, np.full_like(x, end)) for end in (0, self.height - 1)]
+        return [np.stack(rim, -1) for rim in (*sides, *ends)]
+
+    def _covers(self, K: np.ndarray) -> bool:
+        """Whether the photograph shows all that a pinhole camera with this K sees, and there and back is the same."""
+        rim = np.concatenate(self._rims())
+        rays = np.linalg.solve(K, np.column_stack((rim, np.ones(len(rim)))).T).T[:, :2]
+        pixels = self._bend(rays)
+        inside = (pixels > -RIM_SLACK).all() and (
+            pixels < (self.width - 1 + RIM_SLACK, self.height - 1 + RIM_SLACK)
+        ).all()
+        back = np.abs(self._rays(pixels) - rays) * K[[0, 1], [0, 1]]
+        return bool(inside and (back < RIM_SLACK).all())
 
     def straighten(self, picture: np.ndarray, *, nearest: bool = False) -> np.ndarray:
         """The photograph that the pinhole camera would have taken.
@@ -82,19 +101,38 @@ class Lens:
         return np.asarray(straight).reshape(picture.shape)
 
     def straighten_pixels(self, pixels: np.ndarray) -> np.ndarray:
-        """Where the pinhole camera sees what this one sees at ``pixels``, (N, 2), x then y."""
+        """Where the pinhole camera sees what this one sees at ``pixels``, (N, 2), x then y; NaN where it cannot."""
+        return self._rays(pixels) @ self.pinhole[:2, :2].T + self.pinhole[:2, 2]
+
+    def _rays(self, pixels: np.ndarray) -> np.ndarray:
+        """(N, 2) x/z and y/z of what is seen at pixels (N, 2); NaN where the model leads to no ray or to another."""
         import cv2
 
         if len(pixels) == 0:
             return np.zeros((0, 2))
         points = np.ascontiguousarray(pixels, np.float64)[:, None]
         if self.kind == "fisheye":
-            straight = cv2.fisheye.undistortPoints(points, self.intrinsics, self._bent, P=self.pinhole)
+            straight = cv2.fisheye.undistortPoints(points, self.intrinsics, self._bent)
         else:
             # OpenCV's default of five rounds leaves pixels of error in the corners of a wide lens.
             rounds = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
-            straight = cv2.undistortPoints(points, self.intrinsics, self._bent, P=self.pinhole, criteria=rounds)
-        return np.asarray(straight, np.float64).reshape(-1, 2)
+            straight = cv2.undistortPoints(points, self.intrinsics, self._bent, criteria=rounds)
+        rays = np.asarray(straight, np.float64).reshape(-1, 2)
+        # Beyond what the model can undo, OpenCV gives numbers all the same.
+        with np.errstate(invalid="ignore", over="ignore"):
+            missed = np.abs(self._bend(rays) - pixels).max(1)
+        return np.where((missed < RIM_SLACK)[:, None], rays, np.nan)
+
+    def _bend(self, rays: np.ndarray) -> np.ndarray:
+        """Pixels (N, 2) at which this camera sees rays (N, 2)."""
+        import cv2
+
+        if self.kind == "fisheye":
+            bent = cv2.fisheye.distortPoints(np.ascontiguousarray(rays)[:, None], self.intrinsics, self._bent)
+        else:
+            points = np.column_stack((rays, np.ones(len(rays))))
+            bent, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.intrinsics, self._bent)
+        return np.asarray(bent, np.float64).reshape(-1, 2)
 
     @cached_property
     def _bent(self) -> np.ndarray:

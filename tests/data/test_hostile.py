@@ -99,7 +99,7 @@ def test_binary_files_are_read_to_their_end(tmp_path, name):
 @pytest.mark.parametrize(
     ("file", "old", "new", "match"),
     [
-        ("cameras.txt", "2 PINHOLE", "2 OPENCV", "undistort first"),
+        ("cameras.txt", "2 PINHOLE", "2 FOV", "undistort first"),
         ("cameras.txt", "2 PINHOLE", "2 MAGIC", "unknown camera model"),
         ("cameras.txt", "2 PINHOLE", "1 PINHOLE", "twice"),
         ("cameras.txt", "2 PINHOLE", "77 PINHOLE", "does not exist"),
@@ -129,12 +129,12 @@ def test_text_models_are_checked(tmp_path, file, old, new, match):
     refused(tmp_path, match)
 
 
-def test_a_distorted_binary_camera_is_named(tmp_path):
+def test_a_binary_camera_that_opencv_lacks_is_named(tmp_path):
     file = write_colmap(SCENE, tmp_path, form="binary") / MODEL / "cameras.bin"
     content = bytearray(file.read_bytes())
-    content[12] = 5
+    content[12] = 7
     file.write_bytes(bytes(content))
-    refused(tmp_path, "OPENCV_FISHEYE has distortion; undistort first")
+    refused(tmp_path, "camera model FOV is none of OpenCV's; undistort first")
 
 
 def test_other_folders_say_what_is_missing(tmp_path):

@@ -1,0 +1,126 @@
+"""LLFF's ``poses_bounds.npy``: one row a photograph, in the order of the photographs' names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lsmgeo.cameras import from_opencv
+from lsmgeo.data.assembling import MAX_PARAMETER, MAX_SIDE, as_data_error, assemble, check_rotation
+from lsmgeo.data.files import child, has_alpha, image_size
+from lsmgeo.data.npy import read_npy
+from lsmgeo.data.posed import PosedImages
+from lsmgeo.errors import DataError
+
+__all__ = ["is_llff", "read_llff"]
+
+NAME = "poses_bounds.npy"
+COLUMNS = 17
+MAX_BYTES = 1 << 24
+SUFFIXES = (".png", ".jpg", ".jpeg")
+REDUCED = ("images_2", "images_4", "images_8")
+
+
+def is_llff(path: Path) -> bool:
+    """Whether a folder holds ``poses_bounds.npy``, or a file is such an array by its shape."""
+    if path.is_dir():
+        return (path / NAME).is_file()
+    if path.name == NAME:
+        return True
+    if path.suffix != ".npy":
+        return False
+    try:
+        return read_npy(path, MAX_BYTES).shape[1:] == (COLUMNS,)
+    except DataError:
+        return False
+
+
+def read_llff(path: str | Path) -> PosedImages:
+    """Read a scene of LLFF, which NeRF's forward-facing and mip-NeRF 360's photographs share.
+
+    A row is a 3 x 5 matrix ``[R | centre | (height, width, focal length)]``, camera-to-world, and the nearest and
+    farthest depth, which are left out here. (Mildenhall et al., "Local Light Field Fusion", SIGGRAPH 2019.) The
+    photographs are those of ``images``, else of ``images_2``, ``images_4`` or ``images_8``, sorted by name.
+
+    Convention:
+        The columns of R are the camera's down, right and back; they become right, down, forward, and the pose
+        world-to-camera. The principal point is the picture's middle, half-integer: ((width - 1) / 2,
+        (height - 1) / 2) here. Where a photograph has another size than its row, K follows the photograph by
+        the rule for resizing, ``f' = f w' / w``.
+
+    Args:
+        path: the scene's folder, or its ``poses_bounds.npy``.
+
+    Returns:
+        The photographs with their cameras, no sparse points.
+
+    Raises:
+        DataError: a file is missing, damaged or too large, a row makes no sense, there are more or fewer photographs
+            than rows, or one has another shape than its row.
+    """
+    path = Path(path)
+    file = path / NAME if path.is_dir() else path
+    rows = read_npy(file, MAX_BYTES)
+    if rows.ndim != 2 or rows.shape[1] != COLUMNS or len(rows) == 0:
+        raise DataError(file, f"must hold rows of {COLUMNS} numbers; got an array of {rows.shape}")
+    if not (np.abs(rows) < 1e12).all():
+        raise DataError(file, "holds a number that is not finite or beyond 1e12")
+    paths = _pictures(file)
+    if len(paths) != len(rows):
+        found = (
+            f"{len(paths)} pictures are in {paths[0].parent.name!r}" if paths else "no folder images holds a picture"
+        )
+        raise DataError(file, f"has {len(rows)} rows, and {found}")
+
+    matrices = rows[:, :15].reshape(-1, 3, 5)
+    down, right, back = (matrices[:, :, column] for column in range(3))
+    world_from_cam = np.stack((right, down, -back), -1)
+    intrinsics, sizes = np.zeros((len(rows), 3, 3)), []
+    for view, picture in enumerate(paths):
+        where = f"row {view}"
+        check_rotation(world_from_cam[view], file, where)
+        sizes.append(image_size(picture))
+        intrinsics[view] = _intrinsics(matrices[view, :, 4], sizes[-1], file, f"{where} ({picture.name!r})")
+    R = world_from_cam.transpose(0, 2, 1)
+    t = -(R @ matrices[:, :, 3:4])[..., 0]
+    height, width = torch.tensor(sizes).unbind(-1)
+    with as_data_error(file):
+        cameras = from_opencv(
+            torch.from_numpy(intrinsics),
+            torch.from_numpy(R.copy()),
+            torch.from_numpy(t),
+            height,
+            width,
+            pixel_center="half",
+        )
+    names = [picture.name for picture in paths]
+    return assemble(names, paths, cameras, "llff", file=file, cut_out=any(map(has_alpha, paths)))
+
+
+def _pictures(file: Path) -> list[Path]:
+    """The pictures of the first folder that there is, sorted by name."""
+    for name in ("images", *REDUCED):
+        folder = file.parent / name
+        if folder.is_dir():
+            try:
+                found = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+            except OSError as error:
+                raise DataError(folder, f"cannot be read ({error})") from error
+            return [child(file.parent, f"{name}/{picture}", file) for picture in found]
+    return []
+
+
+def _intrinsics(stated: np.ndarray, size: tuple[int, int], file: Path, where: str) -> np.ndarray:
+    """K with half-integer pixel centres of a photograph, whatever resolution its row is of."""
+    height, width, focal = (float(value) for value in stated)
+    if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE and 0 < focal <= MAX_PARAMETER):
+        reason = f"{width:g} x {height:g} pixels (width x height) and a focal length of {focal:g} make no camera"
+        raise DataError(file, f"{where}: {reason}")
+    down, across = size[0] / height, size[1] / width
+    # A reduced picture's sides are whole numbers, so they may miss the exact ratio by a pixel, no more.
+    if abs(size[1] - down * width) > 1 + width / height:
+        reason = f"the row is of {width:g} x {height:g} pixels and the picture has {size[1]} x {size[0]}"
+        raise DataError(file, f"{where}: {reason} (width x height): another shape, so K cannot follow")
+    return np.array([[focal * across, 0, size[1] / 2], [0, focal * down, size[0] / 2], [0, 0, 1]])

@@ -1,0 +1,54 @@
+"""Arrays in NumPy's ``.npy`` form from outside: the header is read and compared with the file before any data."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lsmgeo.data.files import read_bytes
+from lsmgeo.errors import DataError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+__all__ = ["read_npy"]
+
+
+def read_npy(path: Path, limit: int) -> np.ndarray:
+    """Read an array of float32 or float64 from a file of at most ``limit`` bytes.
+
+    Returns:
+        float64, of the shape that the file states.
+
+    Raises:
+        DataError: the file is missing, too large, no such array, of another type, or not as long as its header says.
+    """
+    content = read_bytes(path, limit)
+    stream = io.BytesIO(content)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            version = np.lib.format.read_magic(stream)
+            read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
+            if version == (2, 0):
+                read_header = np.lib.format.read_array_header_2_0
+            if read_header is None:
+                raise DataError(path, f"is of version {version} of .npy; expected 1.0 or 2.0")
+            shape, by_columns, dtype = read_header(stream)
+    except DataError:
+        raise
+    # numpy's parser of headers evaluates a literal, which raises SyntaxError, ValueError, MemoryError and others.
+    except Exception as error:
+        raise DataError(path, f"is not a .npy array ({str(error)[:120]})") from error
+    if dtype not in (np.float32, np.float64) or dtype.hasobject:
+        raise DataError(path, f"must hold float32 or float64; got {dtype}")
+    number = 1
+    for length in shape:
+        number *= int(length)
+    if min(shape, default=1) < 0 or number * dtype.itemsize != len(content) - stream.tell():
+        raise DataError(path, f"states an array of {shape} and holds {len(content) - stream.tell()} bytes of it")
+    values = np.frombuffer(content, dtype, number, stream.tell())
+    return values.reshape(shape, order="F" if by_columns else "C").astype(np.float64)

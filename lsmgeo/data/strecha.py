@@ -1,0 +1,103 @@
+"""Strecha's multi-view scenes: a ``.camera`` file beside every photograph."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lsmgeo.cameras import from_opencv
+from lsmgeo.data.assembling import as_data_error, assemble, check_intrinsics, check_picture, check_rotation
+from lsmgeo.data.files import child, image_size, parse_floats, read_text
+from lsmgeo.data.posed import PosedImages
+from lsmgeo.errors import DataError
+
+__all__ = ["camera_files", "is_strecha", "read_strecha"]
+
+SUFFIX = ".camera"
+MAX_CAMERA_BYTES = 1 << 16
+# Numbers of a file: K, three of radial distortion, R, the centre, width and height.
+PARTS = (9, 3, 9, 3, 2)
+
+
+def camera_files(folder: Path) -> list[Path]:
+    """The ``*.camera`` files of a folder, or of the folders in it, sorted."""
+    for pattern in (f"*{SUFFIX}", f"*/*{SUFFIX}"):
+        found = sorted(path for path in folder.glob(pattern) if path.is_file())
+        if found:
+            return found
+    return []
+
+
+def is_strecha(path: Path) -> bool:
+    """Whether a folder holds such files, or a file is one by its name."""
+    return bool(camera_files(path)) if path.is_dir() else path.suffix == SUFFIX
+
+
+def read_strecha(path: str | Path) -> PosedImages:
+    """Read a scene in the form of Strecha's multi-view benchmark.
+
+    ``0000.png.camera`` belongs to ``0000.png`` and holds K (3 lines), three numbers of radial distortion, R (3 lines),
+    the camera's centre C, then width and height; the projection is ``K [R^T | -R^T C]``. (Strecha, von Hansen, Van
+    Gool, Fua, Thoennessen, "On benchmarking camera calibration and multi-view stereo for high resolution imagery", CVPR
+    2008.) The photographs lie beside these files, in ``images`` there, or in ``images`` beside their folder; ``.P``
+    and ``.bounding`` files are not read.
+
+    Convention:
+        R is camera-to-world with OpenCV axes, and is transposed. Pixel centres are integer, as ours.
+
+    Args:
+        path: the folder of the ``.camera`` files, or the one above it; or one of these files, for all of its folder.
+
+    Returns:
+        The photographs with their cameras, ordered by name; no sparse points.
+
+    Raises:
+        DataError: a file is missing, damaged or too large, several folders hold such files, a camera has distortion,
+            makes no sense, or is of another size than its photograph.
+    """
+    path = Path(path)
+    try:
+        files = camera_files(path if path.is_dir() else path.parent)
+    except OSError as error:
+        raise DataError(path, f"cannot be read ({error})") from error
+    folders = sorted({file.parent for file in files})
+    if len(folders) != 1:
+        found = ", ".join(folder.name for folder in folders[:5]) or "none"
+        raise DataError(path, f"expected *{SUFFIX} files in one folder; found {found}")
+    names, paths, sizes = [], [], []
+    intrinsics, rotations, translations = [], [], []
+    for file in files:
+        numbers = parse_floats(read_text(file, MAX_CAMERA_BYTES).split(), file, "camera")
+        if len(numbers) != sum(PARTS):
+            raise DataError(file, f"expected {sum(PARTS)} numbers (K, distortion, R, centre, size); got {len(numbers)}")
+        parts = np.split(np.array(numbers), np.cumsum(PARTS)[:-1])
+        matrix, radial, rotation, center, (width, height) = parts
+        if radial.any():
+            raise DataError(file, "has radial distortion, whose model the format does not state; undistort first")
+        intrinsics.append(matrix.reshape(3, 3))
+        check_intrinsics(intrinsics[-1], file, "camera")
+        check_rotation(rotation.reshape(3, 3), file, "camera")
+        if np.abs(center).max() > 1e12:
+            raise DataError(file, "the camera's centre lies beyond 1e12")
+        names.append(file.name.removesuffix(SUFFIX))
+        paths.append(_picture(file, names[-1]))
+        sizes.append(image_size(paths[-1]))
+        check_picture((height, width), sizes[-1], paths[-1], file, "camera")
+        rotations.append(rotation.reshape(3, 3).T)
+        translations.append(-rotations[-1] @ center)
+    tall, wide = torch.tensor(sizes).unbind(-1)
+    K, R, t = (torch.from_numpy(np.stack(part)) for part in (intrinsics, rotations, translations))
+    with as_data_error(folders[0]):
+        cameras = from_opencv(K, R, t, tall, wide)
+    return assemble(names, paths, cameras, "strecha", file=folders[0])
+
+
+def _picture(file: Path, name: str) -> Path:
+    for root in (file.parent, file.parent / "images", file.parent.parent / "images"):
+        if root.is_dir():
+            picture = child(root, name, file)
+            if picture.is_file():
+                return picture
+    raise DataError(file, f"finds no picture {name[:80]!r} beside it, in images, nor in ../images")

@@ -1,5 +1,6 @@
 """Posed photographs from files, and shards of shapes to train on: one typed sample, whatever the format."""
 
+from lsmgeo.data.binvox import read_binvox
 from lsmgeo.data.cameras_json import read_cameras_json
 from lsmgeo.data.colmap import read_colmap
 from lsmgeo.data.depth_files import DepthFile, DepthPng
@@ -8,11 +9,13 @@ from lsmgeo.data.files import atomic_file, read_image, write_atomic, write_point
 from lsmgeo.data.lenses import Lens
 from lsmgeo.data.llff import read_llff
 from lsmgeo.data.loading import EpochSampler, ShapeDataset
+from lsmgeo.data.lsm_release import read_lsm
 from lsmgeo.data.members import encode_sample
 from lsmgeo.data.mesh_rendering import render_mesh
 from lsmgeo.data.meshes import Mesh, from_trimesh, load_mesh, normalise
 from lsmgeo.data.middlebury import read_middlebury
 from lsmgeo.data.posed import Observations, PosedImages, SparsePoints, Voxels
+from lsmgeo.data.r2n2 import read_r2n2
 from lsmgeo.data.render_set import Made, render_set
 from lsmgeo.data.rgbd import read_rgbd
 from lsmgeo.data.sample import Batch, Sample, check_sample, collate
@@ -57,11 +60,14 @@ __all__ = [
     "normalise",
     "open",
     "open_scene",
+    "read_binvox",
     "read_cameras_json",
     "read_colmap",
     "read_image",
     "read_llff",
+    "read_lsm",
     "read_middlebury",
+    "read_r2n2",
     "read_rgbd",
     "read_seven_scenes",
     "read_stereo_pair",

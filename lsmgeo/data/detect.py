@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from lsmgeo.data.binvox import is_binvox, read_binvox
 from lsmgeo.data.cameras_json import is_cameras_json, read_cameras_json
 from lsmgeo.data.colmap import model_folder, read_colmap
 from lsmgeo.data.llff import is_llff, read_llff
+from lsmgeo.data.lsm_release import is_lsm, read_lsm
 from lsmgeo.data.middlebury import parameter_files, read_middlebury
 from lsmgeo.data.posed import PosedImages
+from lsmgeo.data.r2n2 import is_r2n2, read_r2n2
 from lsmgeo.data.rgbd import is_rgbd, read_rgbd
 from lsmgeo.data.seven_scenes import is_seven_scenes, read_seven_scenes
 from lsmgeo.data.stereo_pairs import is_stereo_pair, read_stereo_pair
@@ -50,6 +53,11 @@ def _is_colmap(path: Path) -> bool:
     return path.is_dir() and model_folder(path) is not None
 
 
+def _is_solid(path: Path) -> bool:
+    # 3D-R2N2 puts the voxels of an object beside its renderings.
+    return is_binvox(path) and not (path.is_dir() and is_r2n2(path))
+
+
 FORMATS = (
     Format("middlebury", "photographs", "a Middlebury *_par.txt", _is_middlebury, read_middlebury),
     Format("colmap", "photographs", "a COLMAP model (cameras and images, .bin or .txt)", _is_colmap, read_colmap),
@@ -60,6 +68,9 @@ FORMATS = (
     Format("llff", "photographs", "an LLFF poses_bounds.npy", is_llff, read_llff),
     Format("cameras", "photographs", "a cameras.json of lsmgeo's", is_cameras_json, read_cameras_json),
     Format("strecha", "photographs", "Strecha's *.camera files", is_strecha, read_strecha),
+    Format("lsm", "photographs", "render_*.png and camera_*.mat of the LSM release", is_lsm, read_lsm),
+    Format("r2n2", "photographs", "rendering_metadata.txt of 3D-R2N2", is_r2n2, read_r2n2),
+    Format("binvox", "voxels", "a *.binvox file", _is_solid, read_binvox),
 )
 
 

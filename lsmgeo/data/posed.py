@@ -69,6 +69,7 @@ class PosedImages:
         depths: the depth of each photograph, None for one without; None where no photograph has any.
         voxels: the solid that is seen, where the source has it.
         cut_out: whether the photographs' alpha is the outline of the object, which :meth:`load` puts before white.
+        category: the category of the object, where the source names one.
     """
 
     names: tuple[str, ...]
@@ -80,6 +81,7 @@ class PosedImages:
     depths: tuple[DepthFile | None, ...] | None = None
     voxels: Voxels | None = None
     cut_out: bool = False
+    category: str | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -154,7 +156,7 @@ class PosedImages:
 
         Returns:
             Images and cameras (float64); depth where all the photographs have it, mask and occupancy where the source
-            has them; no mesh, no category.
+            has them; no mesh.
 
         Raises:
             OptionError: no view, or one that does not exist.
@@ -189,9 +191,8 @@ class PosedImages:
             depth = None if depth is None else depth / unit
         folder = self.paths[chosen[0]].parent
         name = folder.parent.name if folder.name in ("images", "rendering") else folder.name
-        return Sample(
-            images, cameras, depth, torch.stack(masks) if masks else None, occupancy, None, None, name or self.source
-        )
+        mask = torch.stack(masks) if masks else None
+        return Sample(images, cameras, depth, mask, occupancy, None, self.category, name or self.source)
 
     def _cube(self, grid: VoxelGrid) -> tuple[float, torch.Tensor]:
         """The side and the middle of the cube that the voxels fill."""

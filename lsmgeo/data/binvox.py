@@ -1,0 +1,138 @@
+"""Voxels in Patrick Min's binvox format: a short text header and runs of equal voxels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from lsmgeo._checks import check_choice
+from lsmgeo.data.files import parse_floats, parse_ints, read_bytes
+from lsmgeo.data.posed import Voxels
+from lsmgeo.errors import DataError, LsmGeoError
+from lsmgeo.grids import VoxelGrid
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["PLACEMENTS", "binvox_files", "is_binvox", "read_binvox"]
+
+PLACEMENTS = ("header", "centred")
+SIGNATURE = b"#binvox 1"
+MAX_HEADER_BYTES = 1024
+MAX_SIDE = 1024
+MAX_VOXELS = 1 << 28
+# Two bytes a run, and a run of one voxel each at worst.
+MAX_BYTES = MAX_HEADER_BYTES + 2 * MAX_VOXELS
+
+
+def binvox_files(folder: Path) -> list[Path]:
+    """The ``*.binvox`` files of a folder, sorted."""
+    return sorted(path for path in folder.glob("*.binvox") if path.is_file())
+
+
+def is_binvox(path: Path) -> bool:
+    """Whether a file is of this format by its first bytes, or a folder holds such files."""
+    if path.is_dir():
+        return bool(binvox_files(path))
+    with path.open("rb") as stream:
+        return stream.read(len(SIGNATURE)) == SIGNATURE
+
+
+def read_binvox(path: str | Path, *, placement: str = "header") -> Voxels:
+    """Read a binvox file.
+
+    (Patrick Min, "BINVOX voxel file format specification".) The file's numbers are believed only where all agree: one
+    to 1024 voxels a side, at most 2^28, as many as the runs have, nothing after them.
+
+    Convention:
+        Voxel i of n is centred at ``translate + scale (i + 0.5) / n`` with "header", the format's definition, and at
+        ``((i + 0.5) / n - 0.5) scale`` with "centred": the grids beside the 3D-R2N2 renderings belong to an object
+        around the origin whatever their translate says. The file has y fastest, then z, then x; the result is
+        (D, H, W) with D along z, H along y, W along x.
+
+    Args:
+        path: the file, or a folder that holds just one.
+        placement: "header" or "centred".
+
+    Returns:
+        The occupancy, and its cube in the world.
+
+    Raises:
+        DataError: the file is missing, damaged or too large, or its sides differ: writers disagree on their order.
+        OptionError: another placement.
+    """
+    check_choice("read_binvox", "placement", placement, PLACEMENTS)
+    path = Path(path)
+    if path.is_dir():
+        files = binvox_files(path)
+        if len(files) != 1:
+            found = ", ".join(file.name for file in files[:5]) or "none"
+            raise DataError(path, f"expected one *.binvox file; found {found}")
+        path = files[0]
+    content = read_bytes(path, MAX_BYTES)
+    side, translate, scale, begin = _read_header(content, path)
+    runs = np.frombuffer(content, np.uint8, offset=begin)
+    if len(runs) % 2:
+        raise DataError(path, "ends inside a run of voxels")
+    values, lengths = runs[0::2], runs[1::2]
+    if not (values <= 1).all() or not (lengths > 0).all():
+        raise DataError(path, "holds a run that is empty, or of a value other than 0 and 1")
+    count = int(lengths.sum(dtype=np.int64))
+    if count != side**3:
+        raise DataError(path, f"holds runs of {count} voxels; its header says {side} x {side} x {side}")
+    stored = np.repeat(values.astype(np.bool_), lengths).reshape(side, side, side)  # (x, z, y)
+    lower = tuple(translate) if placement == "header" else (-0.5 * scale,) * 3
+    try:
+        grid = VoxelGrid(side, lower, tuple(low + scale for low in lower))
+    except LsmGeoError as error:
+        raise DataError(path, f"has a scale too small for its translate ({error})") from error
+    return Voxels(torch.from_numpy(np.ascontiguousarray(stored.transpose(1, 2, 0))), grid)
+
+
+def _read_header(content: bytes, path: Path) -> tuple[int, list[float], float, int]:
+    """Voxels a side, translate, scale, and where the runs begin."""
+    found: dict[str, Sequence[float]] = {}
+    start, first = 0, True
+    while True:
+        end = content.find(b"\n", start, MAX_HEADER_BYTES)
+        if end < 0:
+            raise DataError(path, f"has no header of a binvox file in its first {MAX_HEADER_BYTES} bytes")
+        line, start = content[start:end], end + 1
+        if first:
+            if line.split() != SIGNATURE.split():
+                raise DataError(path, "is no binvox file: it begins with another line than '#binvox 1'")
+            first = False
+            continue
+        try:
+            name, *tokens = line.decode("ascii").partition("#")[0].split() or [""]
+        except UnicodeDecodeError as error:
+            raise DataError(path, "has a header that is no plain text") from error
+        if name == "data" and not tokens:
+            break
+        if name:
+            found[name] = _read_line(name, tokens, found, path)
+    missing = [name for name in ("dim", "translate", "scale") if name not in found]
+    if missing:
+        raise DataError(path, f"has a header without {' and '.join(missing)}")
+    sides, (scale,) = [int(side) for side in found["dim"]], found["scale"]
+    if not all(1 <= side <= MAX_SIDE for side in sides) or sides[0] * sides[1] * sides[2] > MAX_VOXELS:
+        raise DataError(path, f"has {sides[0]} x {sides[1]} x {sides[2]} voxels; expected 1 to 645 a side")
+    if len(set(sides)) != 1:
+        raise DataError(
+            path, f"has sides of {sides[0]}, {sides[1]} and {sides[2]} voxels, whose order writers disagree on"
+        )
+    if not 0 < scale <= 1e12 or max(map(abs, found["translate"])) > 1e12:
+        raise DataError(path, f"has scale {scale:g}, translate {found['translate']}: no place for a cube")
+    return sides[0], list(found["translate"]), scale, start
+
+
+def _read_line(name: str, tokens: list[str], found: dict[str, Sequence[float]], path: Path) -> Sequence[float]:
+    wanted = {"dim": 3, "translate": 3, "scale": 1}.get(name)
+    if wanted is None or name in found or len(tokens) != wanted:
+        raise DataError(
+            path, f"has a header line that is none, or is there twice: {name[:40]!r} with {len(tokens)} values"
+        )
+    return parse_ints(tokens, path, name) if name == "dim" else parse_floats(tokens, path, name)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from lsmgeo.data.binvox import is_binvox, read_binvox
+from lsmgeo.data.calibration import is_calibration, read_calibration
 from lsmgeo.data.cameras_json import is_cameras_json, read_cameras_json
 from lsmgeo.data.colmap import model_folder, read_colmap
 from lsmgeo.data.llff import is_llff, read_llff
@@ -68,6 +69,7 @@ FORMATS = (
     Format("llff", "photographs", "an LLFF poses_bounds.npy", is_llff, read_llff),
     Format("cameras", "photographs", "a cameras.json of lsmgeo's", is_cameras_json, read_cameras_json),
     Format("strecha", "photographs", "Strecha's *.camera files", is_strecha, read_strecha),
+    Format("opencv", "calibration", "calibration files of OpenCV's FileStorage", is_calibration, read_calibration),
     Format("lsm", "photographs", "render_*.png and camera_*.mat of the LSM release", is_lsm, read_lsm),
     Format("r2n2", "photographs", "rendering_metadata.txt of 3D-R2N2", is_r2n2, read_r2n2),
     Format("binvox", "voxels", "a *.binvox file", _is_solid, read_binvox),

@@ -1,4 +1,4 @@
-"""The command line: ``lsmgeo demo``, ``reconstruct``, ``render``. Heavy imports wait until a command runs."""
+"""The command line: demo, reconstruct, convert, render. Heavy imports wait until a command runs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from contextlib import ExitStack
 
-__all__ = ["demo", "main", "reconstruct", "render"]
+__all__ = ["convert", "demo", "main", "reconstruct", "render"]
 
 KINDS = {"int": "a whole number", "float": "a finite number"}
 LONGEST_MESSAGE = 300
@@ -229,6 +229,42 @@ def _join(address: str, stack: ExitStack) -> None:
     stack.enter_context(joblib.parallel_config("dask"))
 
 
+def convert(
+    scene: str,
+    to: Literal["colmap", "transforms", "cameras"] = "colmap",
+    out: str = "lsmgeo-convert",
+) -> None:
+    """Write posed photographs in the form that another program reads, straightened where their lens bent them.
+
+    Args:
+        scene: posed photographs in any form that lsmgeo reads.
+        to: "colmap" is a COLMAP model as text, "transforms" a transforms.json of instant-ngp and nerfstudio, "cameras"
+            a plain JSON of K and world-to-camera matrices.
+        out: folder to make for the photographs and their cameras; it must not exist or be empty.
+    """
+    from lsmgeo import data
+
+    images = data.open(scene)
+    write = {"colmap": data.write_colmap, "transforms": data.write_transforms, "cameras": data.write_cameras_json}[to]
+    folder = write(images, out)
+    left = [
+        what
+        for what, there in (
+            ("points", images.points is not None and to != "colmap"),
+            ("depth", images.depths is not None),
+            ("voxels", images.voxels is not None),
+        )
+        if there
+    ]
+    bent = sum(lens is not None for lens in images.lenses or ())
+    print(f"scene:       {len(images)} photographs, {images.source}")
+    if bent:
+        print(f"straight:    {bent} photographs had distortion and are written without, as PNG")
+    if left:
+        print(f"left out:    {', '.join(left)}, which this form does not hold here")
+    print(f"written:     {to} in {folder.resolve()}")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -266,7 +302,7 @@ def _run(arguments: Sequence[str] | None) -> None:
     except PackageNotFoundError:
         from lsmgeo import __version__ as release
     auto_cli(
-        {"demo": demo, "reconstruct": reconstruct, "render": render},
+        {"demo": demo, "reconstruct": reconstruct, "convert": convert, "render": render},
         args=None if arguments is None else list(arguments),
         as_positional=True,
         prog="lsmgeo",

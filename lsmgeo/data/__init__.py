@@ -1,6 +1,7 @@
 """Posed photographs from files, and shards of shapes to train on: one typed sample, whatever the format."""
 
 from lsmgeo.data.binvox import read_binvox
+from lsmgeo.data.calibration import Board, CalibratedLens, Calibration, Rig, read_calibration
 from lsmgeo.data.cameras_json import read_cameras_json
 from lsmgeo.data.colmap import read_colmap
 from lsmgeo.data.depth_files import DepthFile, DepthPng
@@ -19,6 +20,7 @@ from lsmgeo.data.r2n2 import read_r2n2
 from lsmgeo.data.render_set import Made, render_set
 from lsmgeo.data.rgbd import read_rgbd
 from lsmgeo.data.sample import Batch, Sample, check_sample, collate
+from lsmgeo.data.scene_writers import write_cameras_json, write_colmap, write_transforms
 from lsmgeo.data.seven_scenes import read_seven_scenes
 from lsmgeo.data.shard_reading import ShardSet
 from lsmgeo.data.shards import hash_settings, verify_shard, write_shard
@@ -33,6 +35,9 @@ open = open_scene
 __all__ = [
     "FORMATS",
     "Batch",
+    "Board",
+    "CalibratedLens",
+    "Calibration",
     "DepthFile",
     "DepthPng",
     "Disparity",
@@ -44,6 +49,7 @@ __all__ = [
     "Observations",
     "PosedImages",
     "Recipe",
+    "Rig",
     "Sample",
     "ShapeDataset",
     "ShardSet",
@@ -61,6 +67,7 @@ __all__ = [
     "open",
     "open_scene",
     "read_binvox",
+    "read_calibration",
     "read_cameras_json",
     "read_colmap",
     "read_image",
@@ -78,6 +85,9 @@ __all__ = [
     "verify_shard",
     "voxelise",
     "write_atomic",
+    "write_cameras_json",
+    "write_colmap",
     "write_point_cloud",
     "write_shard",
+    "write_transforms",
 ]

@@ -73,7 +73,7 @@ def check_rotation(rotation: np.ndarray, file: Path, where: str) -> None:
         raise DataError(file, f"{where}: the rotation is scaled by {scale:.6g}; divide it by that")
 
 
-def check_picture(stated: tuple[int, int], found: tuple[int, int], picture: Path, file: Path, where: str) -> None:
+def check_picture(stated: tuple[float, float], found: tuple[int, int], picture: Path, file: Path, where: str) -> None:
     """Compare the (height, width) that a camera is made for with that of its picture.
 
     Raises:
@@ -82,7 +82,7 @@ def check_picture(stated: tuple[int, int], found: tuple[int, int], picture: Path
     if stated != found:
         raise DataError(
             file,
-            f"{where}: the camera is of {stated[1]} x {stated[0]} pixels and {picture.name!r} has "
+            f"{where}: the camera is of {stated[1]:g} x {stated[0]:g} pixels and {picture.name!r} has "
             f"{found[1]} x {found[0]} (width x height): K of another resolution",
         )
 

@@ -43,7 +43,7 @@ def read_npy(path: Path, limit: int) -> np.ndarray:
     # numpy's parser of headers evaluates a literal, which raises SyntaxError, ValueError, MemoryError and others.
     except Exception as error:
         raise DataError(path, f"is not a .npy array ({str(error)[:120]})") from error
-    if dtype not in (np.float32, np.float64) or dtype.hasobject:
+    if dtype.kind != "f" or dtype.itemsize not in (4, 8):
         raise DataError(path, f"must hold float32 or float64; got {dtype}")
     number = 1
     for length in shape:

@@ -3,7 +3,6 @@
 The folder is named by ``LSMGEO_TEST_DATA``; the sets themselves cannot be distributed.
 """
 
-import json
 import os
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import torch
 from PIL import Image
 
 from lsmgeo import cli, data
-from lsmgeo.cameras import CameraTensors, from_opencv, from_opengl
+from lsmgeo.cameras import CameraTensors
 from lsmgeo.classical import reconstruct_view
 from lsmgeo.functional import sample_views
 from tests.data.test_stereo_pairs import write_pair
@@ -70,35 +69,20 @@ def test_temple_epipolar_error():
 
 
 def test_fountain_epipolar_error():
-    path = folder("strecha_fountain_quarter")
-    entries = json.loads((path / "cameras.json").read_text())["cameras"]
-    K, R, t = (torch.tensor([entry[name] for entry in entries], dtype=torch.float64) for name in ("K", "R", "t"))
-    cameras = from_opencv(K, R, t, entries[0]["height"], entries[0]["width"])
-    images = [data.read_image(path / entry["name"]) for entry in entries]
-    errors = epipolar_errors(cameras, images, [(index, index + 1) for index in range(0, 10, 2)])
+    scene = data.open(folder("strecha_fountain_quarter"))
+    images = [data.read_image(path) for path in scene.paths]
+    errors = epipolar_errors(scene.cameras, images, [(index, index + 1) for index in range(0, 10, 2)])
     assert len(errors) > 500
     assert np.median(errors) < 0.10
 
 
 def test_nerf_epipolar_error():
-    path = folder("nerf_lego")
-    meta = json.loads((path / "transforms_train.json").read_text())
-    frames = meta["frames"]
+    scene = data.open(folder("nerf_lego"))
     # On white: cut out against the black of transparent pixels, the edges would move.
-    pictures = [cv2.imread(str(path / f"{frame['file_path']}.png"), cv2.IMREAD_UNCHANGED) for frame in frames]
-    alphas = [picture[..., 3:] / 255.0 for picture in pictures]
-    images = [
-        np.round(picture[..., 2::-1] * alpha + 255 * (1 - alpha)).astype(np.uint8)
-        for picture, alpha in zip(pictures, alphas, strict=True)
-    ]
-    height, width = images[0].shape[:2]
-    focal = 0.5 * width / np.tan(0.5 * meta["camera_angle_x"])
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
-    poses = torch.tensor([frame["transform_matrix"] for frame in frames], dtype=torch.float64)
-    cameras = from_opengl(K.expand(len(frames), 3, 3), poses, height, width)
+    images = [(255 * scene.load(view)).round().byte().permute(1, 2, 0).numpy() for view in range(len(scene))]
     # The two frames 7 degrees apart; all others are too far from each other to match.
-    pair = [[frame["file_path"] for frame in frames].index(f"./train/r_{number}") for number in (70, 55)]
-    errors = epipolar_errors(cameras, images, [pair], sampson=True)
+    pair = [scene.names.index(f"./train/r_{number}") for number in (70, 55)]
+    errors = epipolar_errors(scene.cameras, images, [pair], sampson=True)
     assert len(errors) > 100
     assert np.median(errors) < 0.17
 

@@ -1,0 +1,228 @@
+"""Poses of a chessboard, errors of its corners, and calibrations of what was seen of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from lsmgeo.data.calibration import CalibratedLens
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from lsmgeo.diagnosis.board_corners import Seen
+
+__all__ = [
+    "Pose", "Stereo", "board_errors", "calibrate", "calibrate_stereo", "distortion_at_corners", "find_pairs", "pose_of",
+    "project", "rms", "transfer_errors",
+]  # fmt: skip
+
+# Fewer pictures of a board leave a camera undetermined.
+FEWEST = 3
+# How much two ways to the same pose may differ: radians, and parts of the distance of the board.
+ANGLE, SHIFT = 0.02, 0.02
+
+
+class Pose(NamedTuple):
+    """X_to = R X_from + t."""
+
+    R: np.ndarray  # (3, 3)
+    t: np.ndarray  # (3,)
+
+    def applied(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) in the other coordinates."""
+        moved: np.ndarray = points @ self.R.T + self.t
+        return moved
+
+    def inverse(self) -> Pose:
+        """The way back."""
+        return Pose(self.R.T, -self.R.T @ self.t)
+
+
+class Stereo(NamedTuple):
+    """A stereo calibration: its error in pixels, and how the second camera stands to the first."""
+
+    rms: float
+    rig: Pose
+
+
+def rms(errors: np.ndarray) -> float:
+    """The root of the mean square; NaN of nothing."""
+    return float(np.sqrt(np.mean(np.square(errors)))) if len(errors) else float("nan")
+
+
+def pose_of(lens: CalibratedLens, points: np.ndarray, corners: np.ndarray) -> Pose | None:
+    """Board-to-camera of one picture, None where there is none.
+
+    Args:
+        lens: of the camera.
+        points: (N, 3) of the board.
+        corners: (N, 2) pixels.
+    """
+    import cv2
+
+    bent = np.array(lens.coefficients)
+    try:
+        if lens.kind == "fisheye":
+            corners = cv2.fisheye.undistortPoints(corners[:, None], lens.intrinsics, bent)[:, 0]
+            found, turn, t = cv2.solvePnP(points, corners, np.eye(3), np.zeros(4))
+        else:
+            found, turn, t = cv2.solvePnP(points, corners, lens.intrinsics, bent)
+    except cv2.error:
+        return None
+    if not found or not (np.isfinite(turn).all() and np.isfinite(t).all()):
+        return None
+    return Pose(np.asarray(cv2.Rodrigues(turn)[0]), t.ravel())
+
+
+def project(lens: CalibratedLens, points: np.ndarray) -> np.ndarray:
+    """Pixels (N, 2) of points (N, 3) in camera coordinates."""
+    import cv2
+
+    bent, still = np.array(lens.coefficients), np.zeros(3)
+    if lens.kind == "fisheye":
+        pixels, _ = cv2.fisheye.projectPoints(points[:, None], still, still, lens.intrinsics, bent)
+    else:
+        pixels, _ = cv2.projectPoints(points, still, still, lens.intrinsics, bent)
+    return np.asarray(pixels).reshape(-1, 2)
+
+
+def board_errors(lens: CalibratedLens, points: np.ndarray, seen: Sequence[np.ndarray]) -> np.ndarray:
+    """Distances in pixels of all corners from where the lens sees the board at its best pose."""
+    errors = []
+    for corners in seen:
+        pose = pose_of(lens, points, corners)
+        if pose is not None:
+            errors.append(np.linalg.norm(project(lens, pose.applied(points)) - corners, axis=1))
+    return np.concatenate(errors) if errors else np.zeros(0)
+
+
+def distortion_at_corners(lens: CalibratedLens, size: tuple[int, int]) -> float:
+    """How far, in pixels, distortion moves what a pinhole camera would see in a corner of the picture; the largest."""
+    height, width = size
+    corners = np.array([[x, y, 1.0] for x in (0, width - 1) for y in (0, height - 1)])
+    rays = np.linalg.solve(lens.intrinsics, corners.T).T
+    return float(np.linalg.norm(project(lens, rays) - corners[:, :2], axis=1).max())
+
+
+def calibrate(points: np.ndarray, seen: Seen, file: Path) -> tuple[float, CalibratedLens] | None:
+    """Calibrate one camera: its rms in pixels, and its lens with five coefficients; None where that cannot be done."""
+    import cv2
+
+    found = [corners.astype(np.float32)[:, None] for corners in seen.found]
+    if len(found) < FEWEST:
+        return None
+    board = [points.astype(np.float32)] * len(found)
+    try:
+        error, K, bent, *_ = cv2.calibrateCamera(board, found, seen.size[::-1], np.eye(3), np.zeros(5))
+    except cv2.error:
+        return None
+    if not (np.isfinite(error) and np.isfinite(K).all() and np.isfinite(bent).all()):
+        return None
+    return error, CalibratedLens("perspective", K, tuple(map(float, bent.ravel())), seen.size, None, file)
+
+
+def calibrate_stereo(
+    points: np.ndarray,
+    lenses: tuple[CalibratedLens, CalibratedLens],
+    pairs: Sequence[tuple[np.ndarray, np.ndarray]],
+    size: tuple[int, int],
+) -> Stereo | None:
+    """How the second camera stands to the first, their lenses held; None where that cannot be told.
+
+    Args:
+        points: (N, 3) of the board.
+        lenses: of both cameras, "perspective".
+        pairs: corners in both pictures of each pair, (N, 2) pixels each.
+        size: (height, width) of the pictures.
+    """
+    import cv2
+
+    if len(pairs) < FEWEST:
+        return None
+    board = [points.astype(np.float32)] * len(pairs)
+    first, second = ([pair[side].astype(np.float32)[:, None] for pair in pairs] for side in (0, 1))
+    bent = [np.array(lens.coefficients) for lens in lenses]
+    try:
+        error, *_, R, t, _, _ = cv2.stereoCalibrate(
+            board,
+            first,
+            second,
+            lenses[0].intrinsics,
+            bent[0],
+            lenses[1].intrinsics,
+            bent[1],
+            size[::-1],
+            flags=cv2.CALIB_FIX_INTRINSIC,
+        )
+    except cv2.error:
+        return None
+    return Stereo(float(error), Pose(np.asarray(R), t.ravel())) if np.isfinite(error) else None
+
+
+def transfer_errors(
+    rig: Pose,
+    points: np.ndarray,
+    lenses: tuple[CalibratedLens, CalibratedLens],
+    pairs: Sequence[tuple[np.ndarray, np.ndarray]],
+) -> np.ndarray:
+    """Distances in pixels, in the second picture, of corners from where the first picture and the rig put them.
+
+    Args:
+        rig: first to second camera, in squares.
+        points: (N, 3) of the board.
+        lenses: of both cameras.
+        pairs: corners in both pictures of each pair, (N, 2) pixels each.
+    """
+    errors = []
+    for first, second in pairs:
+        pose = pose_of(lenses[0], points, first)
+        if pose is not None:
+            errors.append(np.linalg.norm(project(lenses[1], rig.applied(pose.applied(points))) - second, axis=1))
+    return np.concatenate(errors) if errors else np.zeros(0)
+
+
+def find_pairs(
+    points: np.ndarray,
+    lenses: tuple[CalibratedLens, CalibratedLens],
+    first: Sequence[np.ndarray],
+    second: Sequence[np.ndarray],
+) -> list[tuple[int, int]]:
+    """Which picture of the second camera belongs to which of the first, by the rig that most of them agree on.
+
+    Each pair of pictures, one of either camera, says how the cameras would stand if the two were taken at once; true
+    pairs all say the same.
+
+    Returns:
+        Pairs of indices, each picture once at most.
+    """
+    poses = [
+        [pose_of(lens, points, corners) for corners in side] for lens, side in zip(lenses, (first, second), strict=True)
+    ]
+    choices = [
+        (a, b, Pose(second_pose.R @ first_pose.R.T, second_pose.t - second_pose.R @ first_pose.R.T @ first_pose.t))
+        for a, first_pose in enumerate(poses[0]) if first_pose is not None
+        for b, second_pose in enumerate(poses[1]) if second_pose is not None
+    ]  # fmt: skip
+    if not choices:
+        return []
+    R, t = np.stack([rig.R for *_, rig in choices]), np.stack([rig.t for *_, rig in choices])
+    distance = np.median([np.linalg.norm(pose.t) for side in poses for pose in side if pose is not None])
+    best: list[tuple[int, int]] = []
+    for _, _, rig in choices:
+        # The angle of a small rotation is |R - R'| / sqrt 2.
+        angle = np.linalg.norm(R - rig.R, axis=(1, 2)) / np.sqrt(2)
+        shift = np.linalg.norm(t - rig.t, axis=1) / distance
+        misfit = angle / ANGLE + shift / SHIFT
+        taken: dict[int, int] = {}
+        for index in np.argsort(misfit):
+            a, b, _ = choices[index]
+            if misfit[index] > 1:
+                break
+            if a not in taken and b not in taken.values():
+                taken[a] = b
+        if len(taken) > len(best):
+            best = sorted(taken.items())
+    return best

@@ -1,0 +1,387 @@
+"""Whether a calibration is that of its chessboard pictures, and which mistake explains it where it is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from lsmgeo.diagnosis.board_corners import Seen, board_points, look_at
+from lsmgeo.diagnosis.board_fitting import (
+    Pose,
+    board_errors,
+    calibrate,
+    calibrate_stereo,
+    distortion_at_corners,
+    find_pairs,
+    project,
+    rms,
+    transfer_errors,
+)
+from lsmgeo.diagnosis.findings import Cause, Check, Findings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from lsmgeo.data.calibration import CalibratedLens, Calibration
+
+__all__ = ["examine_calibration"]
+
+# OpenCV's samples look for this board where nothing else is stated.
+USUAL_BOARD = (9, 6)
+MOST_PICTURES = 60
+# A calibration of sharp pictures reaches 0.1 to 0.5 px; one of other pictures misses by several.
+LIMIT = 1.0
+# Resolutions that are made from each other.
+SCALES = tuple(sorted({a / b for a in (1, 2, 3, 4, 8) for b in (1, 2, 3, 4, 8)} - {1.0}))
+OPENGL, FLIP = np.diag([1.0, -1.0, -1.0]), np.diag([1.0, -1.0, 1.0])
+
+Pairs = list[tuple[np.ndarray, np.ndarray]]
+
+
+class _Scene(NamedTuple):
+    """What the pictures show, and what they say of the cameras by themselves."""
+
+    points: np.ndarray  # (N, 3), in squares
+    paths: tuple[tuple[Path, ...], ...]
+    seen: tuple[Seen, ...]
+    lenses: tuple[CalibratedLens, ...]  # calibrated anew, one a camera; empty where that cannot be done
+    errors: tuple[float, ...]  # their rms in pixels
+
+
+class _Report(NamedTuple):
+    """Findings in the making."""
+
+    facts: list[tuple[str, str]]
+    checks: list[Check]
+    causes: list[Cause]
+    remarks: list[str]
+
+
+def examine_calibration(calibration: Calibration, path: Path) -> Findings:
+    """Compare a calibration with the chessboards in its pictures.
+
+    Measured are, as far as the pictures and the files allow: the error of a calibration from scratch, of one camera or
+    of a pair (OpenCV's ``calibrateCamera``, then ``stereoCalibrate`` with both lenses held); the error of the corners
+    under each lens that is stated, the board at its best pose; the error under stated poses of the board; and the error
+    at which a stated rig carries corners from the first picture to the second. All are root mean squares in pixels.
+
+    Corners have no unit, so that the length of a rig's T is compared only where the size of a square is stated. Half a
+    pixel in a principal point is below what this can tell: the board's pose takes it up, and the error changes in the
+    third digit.
+
+    Args:
+        calibration: what was read.
+        path: from where, for what is said to the reader.
+
+    Returns:
+        The findings. A mistake is named where undoing it brings an error from above 1 px to below, and to a half.
+
+    Raises:
+        DataError: a picture is damaged.
+    """
+    report = _Report([], [], [], [])
+    _state(calibration, report)
+    if not any(calibration.pictures):
+        report.remarks.append(f"{path} names no picture of a board: nothing can be measured.")
+        return _concluded(report)
+    scene = _look(calibration, report)
+    if not all(seen.found for seen in scene.seen):
+        report.remarks.append("A camera shows the board in no picture: nothing can be measured.")
+        return _concluded(report)
+    pairs = _examine_pictures(scene, report)
+    good = _examine_lenses(calibration, scene, report)
+    if calibration.rig is not None and pairs:
+        _examine_rig(calibration, scene, good, pairs, report)
+    _examine_views(calibration, scene, report)
+    return _concluded(report)
+
+
+def _concluded(report: _Report) -> Findings:
+    # Of several mistakes the first: pictures come before lenses, and these before rigs, which are measured with them.
+    cause = report.causes[0] if report.causes else None
+    others = [f"Also {cause.name}: {cause.evidence}. {cause.remedy}" for cause in report.causes[1:]]
+    return Findings(tuple(report.facts), tuple(report.checks), cause, (*report.remarks, *others))
+
+
+def _state(calibration: Calibration, report: _Report) -> None:
+    for name, lens in calibration.lenses.items():
+        fx, fy, cx, cy = lens.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
+        text = f"focal lengths {fx:.1f} and {fy:.1f} px, principal point ({cx:.1f}, {cy:.1f}), {lens.kind}"
+        if lens.size is not None:
+            text += f", {lens.size[1]} x {lens.size[0]} pixels"
+        report.facts.append((f"lens {name}", text))
+    board = calibration.board
+    if board is not None:
+        square = "" if board.square is None else f", squares of {board.square:.6g}"
+        report.facts.append(("board", f"{board.corners[0]} x {board.corners[1]} corners{square}"))
+    if calibration.rig is not None:
+        length = float(np.linalg.norm(calibration.rig.translation))
+        turn = np.degrees(np.arccos(np.clip((np.trace(calibration.rig.rotation) - 1) / 2, -1, 1)))
+        text = f"baseline {length:.6g}, turned by {turn:.2f} degrees"
+        if board is not None and board.square is not None:
+            text += f"; that is {length / board.square:.3f} squares"
+        report.facts.append(("rig", text))
+
+
+def _look(calibration: Calibration, report: _Report) -> _Scene:
+    board = calibration.board
+    corners = USUAL_BOARD if board is None else board.corners
+    if board is None:
+        report.facts.append(("board", f"{corners[0]} x {corners[1]} corners, as in OpenCV's samples; none is stated"))
+    count = len(calibration.pictures[0])
+    chosen = np.unique(np.linspace(0, count - 1, min(count, MOST_PICTURES)).round().astype(int))
+    if len(chosen) < count:
+        report.remarks.append(f"Of {count} pictures a camera {len(chosen)} were looked at.")
+    paths = tuple(tuple(side[index] for index in chosen) for side in calibration.pictures)
+    seen = tuple(look_at(side, corners) for side in paths)
+    points = board_points(corners)
+    for side, what in zip(seen, ("first camera", "second camera") if len(seen) > 1 else ("camera",), strict=True):
+        text = f"board found in {len(side.found)} of {len(side.corners)} pictures of {side.size[1]} x {side.size[0]}"
+        report.facts.append((what, text))
+    anew = [calibrate(points, side, files[0]) for side, files in zip(seen, paths, strict=True)]
+    fitted = [result for result in anew if result is not None]
+    if len(fitted) < len(anew):
+        report.remarks.append("Too few pictures of the board for a calibration from scratch.")
+        fitted = []
+    return _Scene(points, paths, seen, tuple(lens for _, lens in fitted), tuple(error for error, _ in fitted))
+
+
+def _pairs(scene: _Scene) -> Pairs:
+    if len(scene.seen) < 2:
+        return []
+    both = zip(scene.seen[0].corners, scene.seen[1].corners, strict=True)
+    return [(first, second) for first, second in both if first is not None and second is not None]
+
+
+def _examine_pictures(scene: _Scene, report: _Report) -> Pairs:
+    """Calibrate from scratch; the pairs of corners, which are those of the list unless it was shuffled."""
+    for error, side, lens in zip(scene.errors, scene.seen, scene.lenses, strict=True):
+        what = "rms of a calibration from scratch"
+        if len(scene.seen) == 1:
+            report.checks.append(Check(what, error, "px", LIMIT, len(side.found) * len(scene.points), "corners"))
+        report.facts.append(("calibrated anew", f"{_lens_text(lens, side.size)}; rms {error:.3f} px"))
+    pairs = _pairs(scene)
+    if len(scene.lenses) < 2:
+        return pairs
+    lenses = scene.lenses[0], scene.lenses[1]
+    stereo = calibrate_stereo(scene.points, lenses, pairs, scene.seen[0].size)
+    if stereo is None:
+        return pairs
+    what = "rms of a stereo calibration from scratch"
+    report.checks.append(Check(what, stereo.rms, "px", LIMIT, 2 * len(pairs) * len(scene.points), "corners"))
+    if stereo.rms <= LIMIT:
+        report.facts.append(("measured baseline", f"{np.linalg.norm(stereo.rig.t):.3f} squares"))
+        return pairs
+    if max(scene.errors) > LIMIT:
+        return []
+    return _pair_anew(scene, stereo.rms, report)
+
+
+def _pair_anew(scene: _Scene, stated: float, report: _Report) -> Pairs:
+    numbers = [[index for index, corners in enumerate(side.corners) if corners is not None] for side in scene.seen]
+    lenses = scene.lenses[0], scene.lenses[1]
+    found = find_pairs(scene.points, lenses, scene.seen[0].found, scene.seen[1].found)
+    pairs = [(scene.seen[0].found[a], scene.seen[1].found[b]) for a, b in found]
+    stereo = calibrate_stereo(scene.points, lenses, pairs, scene.seen[0].size)
+    # A few pictures always agree on some rig; half of all do not.
+    if stereo is None or stereo.rms > LIMIT or 2 * len(pairs) < min(map(len, numbers)):
+        return []
+    told = [(scene.paths[0][numbers[0][a]].name, scene.paths[1][numbers[1][b]].name) for a, b in found]
+    some = ", ".join(f"{first} with {second}" for first, second in told[:4])
+    evidence = f"paired otherwise, the rms of a stereo calibration falls from {stated:.3g} px to {stereo.rms:.3g} px"
+    remedy = f"List beside each other the pictures that were taken at once: {some}{', ...' if len(told) > 4 else ''}."
+    report.causes.append(Cause("frames shuffled", evidence, remedy))
+    return pairs
+
+
+def _lens_text(lens: CalibratedLens, size: tuple[int, int]) -> str:
+    focal = lens.intrinsics[[0, 1], [0, 1]]
+    view = np.degrees(2 * np.arctan(np.array(size[::-1]) / (2 * focal)))
+    bent = distortion_at_corners(lens, size)
+    return (
+        f"focal lengths {focal[0]:.1f} and {focal[1]:.1f} px, view {view[0]:.1f} x {view[1]:.1f} degrees, "
+        f"distortion in the corners {bent:.1f} px"
+    )
+
+
+def _examine_lenses(calibration: Calibration, scene: _Scene, report: _Report) -> dict[int, CalibratedLens]:
+    """Compare each stated lens with its pictures; the good ones of a pair, by camera."""
+    good: dict[int, CalibratedLens] = {}
+    sides: dict[str, int] = {}
+    bad: set[str] = set()
+    for name, lens in calibration.lenses.items():
+        errors = [rms(board_errors(lens, scene.points, side.found)) for side in scene.seen]
+        # A lens of its own file may be of either camera; one of a pair says of which.
+        side = {"first": 0, "second": len(errors) - 1}.get(name, int(np.nanargmin([*errors, np.inf])))
+        side = min(side, len(errors) - 1)
+        sides[name] = side
+        count = len(scene.seen[side].found) * len(scene.points)
+        of = ("first", "second")[side] + " camera's corners" if len(errors) > 1 else "corners"
+        report.checks.append(Check(f"rms under the lens {name}", errors[side], "px", LIMIT, count, of))
+        report.facts.append((f"lens {name} on its pictures", _lens_text(lens, scene.seen[side].size)))
+        if errors[side] <= LIMIT:
+            good[side] = good.get(side, lens)
+        else:
+            bad.add(name)
+    failed = {name: lens for name, lens in calibration.lenses.items() if name in bad}
+    if {"first", "second"} <= set(failed) and len(scene.seen) > 1:
+        first, second = calibration.lenses["first"], calibration.lenses["second"]
+        swapped = [
+            rms(board_errors(lens, scene.points, side.found))
+            for lens, side in zip((second, first), scene.seen, strict=True)
+        ]
+        if max(swapped) <= LIMIT:
+            evidence = f"exchanged, the lenses see the corners to {max(swapped):.3g} px"
+            remedy = "The first lens is that of the second pictures: exchange lenses or pictures."
+            report.causes.append(Cause("left and right exchanged", evidence, remedy))
+            return good
+    for name, lens in failed.items():
+        _explain_lens(name, lens, scene, sides[name], report)
+    return good
+
+
+def _explain_lens(name: str, lens: CalibratedLens, scene: _Scene, side: int, report: _Report) -> None:
+    seen = scene.seen[side]
+    stated = rms(board_errors(lens, scene.points, seen.found))
+    resized = [(rms(board_errors(_scaled(lens, scale), scene.points, seen.found)), scale) for scale in SCALES]
+    error, scale = min(resized, key=lambda pair: np.nan_to_num(pair[0], nan=np.inf))
+    if error <= LIMIT and error < 0.5 * stated:
+        evidence = (
+            f"with K times {scale:.4g}, the rms under the lens {name} falls from {stated:.3g} px to {error:.3g} px"
+        )
+        remedy = (
+            f"The pictures are {scale:.4g} times as large as those that were calibrated: "
+            "scale K by that (c becomes (c + 0.5) s - 0.5), or use pictures of the calibrated size."
+        )
+        report.causes.append(Cause("K of another resolution", evidence, remedy))
+    elif scene.errors and scene.errors[side] < min(LIMIT, 0.5 * stated):
+        bent, fitted = distortion_at_corners(lens, seen.size), distortion_at_corners(scene.lenses[side], seen.size)
+        evidence = (
+            f"calibrated anew from the pictures, the rms under the lens {name} falls from {stated:.3g} px to "
+            f"{scene.errors[side]:.3g} px; distortion in the corners is stated as {bent:.3g} px and measured as "
+            f"{fitted:.3g} px"
+        )
+        remedy = (
+            f"{lens.file.name} is not the calibration of these pictures: calibrate anew, or look for the right file."
+        )
+        report.causes.append(Cause("lens of other pictures", evidence, remedy))
+
+
+def _scaled(lens: CalibratedLens, scale: float) -> CalibratedLens:
+    K = lens.intrinsics.copy()
+    K[:2] *= scale
+    K[:2, 2] += 0.5 * scale - 0.5
+    return replace(lens, intrinsics=K)
+
+
+def _other_poses(pose: Pose) -> list[tuple[str, str, str, Pose]]:
+    """What a pose is where a mistake was made with it, common ones first: name, correction, remedy, pose."""
+
+    def turned(axes: np.ndarray) -> Pose:
+        return Pose(axes @ pose.R @ axes, axes @ pose.t)
+
+    return [
+        ("poses inverted", "inverted", "R and T lead the other way: use R^T and -R^T T.", pose.inverse()),
+        ("OpenGL axes", "with y and z negated", "The axes are OpenGL's: negate y and z on both sides.", turned(OPENGL)),
+        ("y flipped", "with y negated", "y points up: negate it on both sides of R and in T.", turned(FLIP)),
+        ("rotation transposed", "with R transposed", "Transpose R.", Pose(pose.R.T, pose.t)),
+        ("translation negated", "with T negated", "T has the wrong sign: negate it.", Pose(pose.R, -pose.t)),
+    ]
+
+
+def _examine_rig(
+    calibration: Calibration, scene: _Scene, good: dict[int, CalibratedLens], pairs: Pairs, report: _Report
+) -> None:
+    rig = calibration.rig
+    # A lens that is wrong by itself must not speak against the rig.
+    lenses = [good.get(side) or (scene.lenses[side] if scene.lenses else None) for side in (0, 1)]
+    first, second = lenses
+    if rig is None or first is None or second is None:
+        return
+    stereo = calibrate_stereo(scene.points, (first, second), pairs, scene.seen[0].size)
+    length = float(np.linalg.norm(rig.translation))
+    if stereo is None or length == 0:
+        return
+    measured = float(np.linalg.norm(stereo.rig.t))
+    square = None if calibration.board is None else calibration.board.square
+    if square is not None and not 0.95 < length / square / measured < 1.05:
+        report.remarks.append(
+            f"T is {length:.6g} long, which would be {length / square:.4g} squares; {measured:.4g} are measured: "
+            "T or the square's size is in other units."
+        )
+
+    def error_of(pose: Pose) -> float:
+        # The pictures do not tell lengths, so T gets the one that was measured.
+        placed = Pose(pose.R, pose.t * (measured / length))
+        return rms(transfer_errors(placed, scene.points, (first, second), pairs))
+
+    stated = Pose(rig.rotation, rig.translation)
+    error = error_of(stated)
+    check = Check("rms of corners carried by the rig", error, "px", LIMIT, len(pairs) * len(scene.points), "corners")
+    report.checks.append(check)
+    _explain_pose(stated, error, error_of, "corners carried by the rig", report)
+
+
+def _explain_pose(stated: Pose, error: float, error_of: Callable[[Pose], float], what: str, report: _Report) -> None:
+    if error <= LIMIT:
+        return
+    tried = [(error_of(pose), name, how, remedy) for name, how, remedy, pose in _other_poses(stated)]
+    best, name, how, remedy = min(tried, key=lambda row: np.nan_to_num(row[0], nan=np.inf))
+    if best <= LIMIT and best < 0.5 * error:
+        evidence = f"{how}, the rms of {what} falls from {error:.3g} px to {best:.3g} px"
+        report.causes.append(Cause(name, evidence, remedy))
+
+
+def _examine_views(calibration: Calibration, scene: _Scene, report: _Report) -> None:
+    """Compare stated poses of the board with the pictures, where there are as many of both."""
+    board = calibration.board
+    for name, lens in calibration.lenses.items():
+        if lens.views is None or board is None or board.square is None:
+            continue
+        errors = [rms(board_errors(lens, scene.points, side.found)) for side in scene.seen]
+        seen = scene.seen[int(np.nanargmin([*errors, np.inf])) if np.isfinite(errors).any() else 0]
+        rows = seen.found if len(seen.found) == len(lens.views) else []
+        if not rows:
+            count = f"{len(lens.views)} poses of the board, which was found in {len(seen.found)} pictures"
+            report.remarks.append(f"The lens {name} states {count}.")
+            continue
+        _compare_views(lens, name, scene.points * board.square, rows, report)
+
+
+def _compare_views(
+    lens: CalibratedLens, name: str, points: np.ndarray, rows: Sequence[np.ndarray], report: _Report
+) -> None:
+    import cv2
+
+    views = np.zeros((0, 6)) if lens.views is None else lens.views
+    poses = [Pose(np.asarray(cv2.Rodrigues(view[:3])[0]), view[3:]) for view in views]
+
+    def table(change: int | None) -> np.ndarray:
+        """(poses, pictures) rms in pixels; a board may be numbered from either end."""
+        changed = poses if change is None else [_other_poses(pose)[change][3] for pose in poses]
+        ends = [project(lens, pose.applied(points)) for pose in changed]
+        return np.array(
+            [[min(rms(np.linalg.norm(p - c, axis=1)) for p in (end, end[::-1])) for c in rows] for end in ends]
+        )
+
+    as_is = table(None)
+    error = rms(as_is.diagonal())
+    count = len(rows) * len(points)
+    report.checks.append(Check(f"rms under the poses of {name}", error, "px", LIMIT, count, "corners"))
+    if error <= LIMIT:
+        return
+    shuffled = rms(as_is.min(1))
+    if shuffled <= LIMIT and len(set(as_is.argmin(1))) == len(rows):
+        evidence = f"in another order, the rms under the poses of {name} falls from {error:.3g} px to {shuffled:.3g} px"
+        remedy = "Poses and pictures stand in different orders: list the pictures in the order of the calibration."
+        report.causes.append(Cause("frames shuffled", evidence, remedy))
+        return
+    for change, (cause, how, remedy, _) in enumerate(_other_poses(poses[0])):
+        corrected = rms(table(change).diagonal())
+        if corrected <= LIMIT and corrected < 0.5 * error:
+            evidence = f"{how}, the rms under the poses of {name} falls from {error:.3g} px to {corrected:.3g} px"
+            report.causes.append(Cause(cause, evidence, remedy))
+            return

@@ -90,5 +90,6 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
 }
-html_sidebars = {"index": [], "references": [], "conventions": [], "theory": [], "errors": [], "coming_from": []}
+without_siblings = ("index", "references", "conventions", "theory", "errors", "coming_from", "troubleshooting")
+html_sidebars = {page: [] for page in (*without_siblings, "formats/index")}
 html_show_sourcelink = False

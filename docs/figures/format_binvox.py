@@ -10,13 +10,13 @@ chair[0:5, [3, 4, 8, 9]] = True
 chair[4:6, 3:10] = True
 chair[5:12, 3:5] = True
 
-figure = plt.figure(figsize=(8.4, 4.0))
+figure = plt.figure(figsize=(7.2, 3.5))
 placements = (
     ("as the header says", TRANSLATE, SAME, "translate + scale (i + 1/2) / n"),
     ("about the middle", (-SCALE / 2, -SCALE / 2), OTHER, "scale ((i + 1/2) / n - 1/2)"),
 )
 for number, (title, corner, colour, equation) in enumerate(placements):
-    axes = panel(figure, 0.15 + 4.2 * number, 0.08, 1.95, (-0.65, 1.28, -0.72, 1.1), title)
+    axes = panel(figure, 0.1 + 3.6 * number, 0.08, 1.7, (-0.65, 1.28, -0.72, 1.1), title)
     axes.title.set(color=colour, fontsize=11, fontweight="bold")
     step = SCALE / SIDE
     for row, column in np.argwhere(chair):

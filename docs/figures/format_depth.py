@@ -4,8 +4,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from format_drawing import INK, OTHER, SAME, SHADE, arrow, panel
 
-figure = plt.figure(figsize=(8.4, 3.2))
-axes = panel(figure, 0.1, 0.1, 1.0, (-0.6, 7.6, -0.75, 2.35))
+figure = plt.figure(figsize=(7.2, 2.8))
+axes = panel(figure, 0.05, 0.05, 0.86, (-0.6, 7.6, -0.75, 2.35))
 z, height = 4.6, 1.7
 axes.fill([0, 5.6, 5.6], [0, 2.35, -0.35], color=SHADE, alpha=0.1, lw=0)
 axes.plot([0, 7.5], [0, 0], color=INK, lw=0.9)
@@ -25,11 +25,11 @@ axes.plot([0, 0], [-0.6, 0], color=SAME, lw=0.9, ls="--")
 axes.plot([z, z], [-0.6, 0], color=SAME, lw=0.9, ls="--")
 axes.text(2.9, -0.45, "depth z: what all readers give", color=SAME, fontsize=9.5, ha="center", va="bottom")
 axes.text(
-    5.0,
+    4.9,
     1.55,
     r"distance $= z\,\sqrt{1 + (\frac{u - c_x}{f_x})^2 + (\frac{v - c_y}{f_y})^2}$",
     color=INK,
-    fontsize=9.5,
+    fontsize=9,
     ha="left",
     va="center",
 )

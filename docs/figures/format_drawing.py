@@ -17,7 +17,6 @@ DIRECTIONS = {
     "back": (0, 0, -1),
 }
 OURS = ("right", "down", "forward")
-NAMES = {OURS: "OpenCV's", ("right", "up", "back"): "OpenGL's"}
 
 
 def flatten(points: np.ndarray) -> np.ndarray:
@@ -54,6 +53,23 @@ def arrow(axes: Axes, start: np.ndarray, end: np.ndarray, colour: str = INK, wid
     axes.annotate("", tuple(end), tuple(start), arrowprops=style, zorder=5)
 
 
+def write(
+    axes: Axes, place: np.ndarray, text: str, colour: str = INK, *, by: tuple[float, float] = (0, 0), **style
+) -> None:
+    """Words at a place, moved ``by`` some units."""
+    axes.text(*np.add(place, by), text, color=colour, **{"fontsize": 9, **style})
+
+
+def draw_axis(
+    axes: Axes, start: np.ndarray, end: np.ndarray, letter: str, beyond: float = 0.12, width: float = 1.8
+) -> None:
+    """An axis with its letter beyond its point."""
+    arrow(axes, start, end, AXIS_COLOURS[letter], width)
+    way = np.subtract(end, start)
+    place = end + beyond * way / np.linalg.norm(way)
+    write(axes, place, letter, AXIS_COLOURS[letter], fontsize=11, fontweight="bold", ha="center", va="center", zorder=7)
+
+
 def draw_camera(axes: Axes, directions: tuple[str, str, str], *, letters: str = "xyz") -> None:
     """A camera seen from behind, its image in front of it, and the axes that ``directions`` say."""
     corners = np.array([[-0.75, -0.5, 1.7], [0.75, -0.5, 1.7], [0.75, 0.5, 1.7], [-0.75, 0.5, 1.7]])
@@ -66,14 +82,9 @@ def draw_camera(axes: Axes, directions: tuple[str, str, str], *, letters: str = 
     axes.plot(*center, "o", color=INK, ms=5, zorder=6)
     # The picture's own corner: rows run down the picture whatever the camera's y does.
     axes.plot(*plane[0], "s", color=INK, ms=4.5, zorder=6)
-    axes.text(*(plane[0] + (-0.05, 0.09)), "pixel (0, 0)", fontsize=7.5, color=INK, ha="left", va="bottom")
+    write(axes, plane[0], "pixel (0, 0)", by=(-0.05, 0.09), fontsize=7.5, va="bottom")
     for letter, name in zip(letters, directions, strict=True):
-        tip = np.array(DIRECTIONS[name])
-        end = flatten(tip)
-        colour = AXIS_COLOURS["xyz"[letters.index(letter)]]
-        arrow(axes, center, end, colour)
-        beyond = flatten(1.18 * tip)
-        axes.text(*beyond, letter, color=colour, fontsize=11, fontweight="bold", ha="center", va="center", zorder=7)
+        draw_axis(axes, center, flatten(np.array(DIRECTIONS[name])), letter, 0.18)
 
 
 def draw_direction(axes: Axes, label: str, *, to_camera: bool, colour: str) -> None:
@@ -96,7 +107,7 @@ def draw_direction(axes: Axes, label: str, *, to_camera: bool, colour: str) -> N
     axes.text(1.46, -0.55, way, ha="center", va="top", fontsize=9, color=colour)
 
 
-def draw_pixels(axes: Axes, center: float | None, colour: str) -> None:
+def draw_pixels(axes: Axes, center: float, colour: str) -> None:
     """The picture's first pixels, with the coordinates of the first one's centre."""
     for row in range(2):
         for column in range(3):
@@ -107,9 +118,6 @@ def draw_pixels(axes: Axes, center: float | None, colour: str) -> None:
     axes.plot([-0.5, 2.5], [-0.5, -0.5], color=INK, lw=1.2)
     axes.plot([-0.5, -0.5], [-0.5, 1.5], color=INK, lw=1.2)
     axes.plot(0, 0, "o", color=colour, ms=6)
-    if center is None:
-        axes.text(0.14, 0.0, " ?", color=colour, fontsize=10, va="center")
-        return
     axes.text(0.14, 0.03, f"({center:g}, {center:g})", color=colour, fontsize=9, va="center")
     axes.text(-0.5, -0.62, f"({center - 0.5:g}, {center - 0.5:g})", color=INK, fontsize=8, ha="center", va="bottom")
 
@@ -133,9 +141,9 @@ def draw_conventions(
         center: coordinates of the first pixel's centre.
         letters: names of the three axes.
     """
-    figure = plt.figure(figsize=(8.4, 5.0))
+    figure = plt.figure(figsize=(7.2, 4.4))
     rows = (
-        (2.55, source, directions, letters, matrix, to_camera, center),
+        (2.25, source, directions, letters, matrix, to_camera, center),
         (0.05, "lsmgeo", OURS, "xyz", "cam_from_world", True, 0.0),
     )
     for bottom, name, axis_names, axis_letters, label, forwards, first in rows:
@@ -143,9 +151,9 @@ def draw_conventions(
         colours = [SAME if equal else OTHER for equal in same]
         described = ", ".join(f"{letter} {where}" for letter, where in zip(axis_letters, axis_names, strict=True))
         how = "integer" if first == 0 else "half-integer"
-        left = panel(figure, 0.05, bottom, 0.77, (-1.15, 2.3, -1.3, 1.42), described)
-        middle = panel(figure, 3.0, bottom, 0.66, (-0.75, 3.75, -1.45, 1.75), name)
-        right = panel(figure, 6.2, bottom + 0.35, 0.6, (-0.9, 2.5, 1.6, -1.25), f"{how} pixel centres")
+        left = panel(figure, 0.05, bottom, 0.66, (-1.15, 2.3, -1.3, 1.42), described)
+        middle = panel(figure, 2.5, bottom, 0.57, (-0.75, 3.75, -1.45, 1.75), name)
+        right = panel(figure, 5.25, bottom + 0.3, 0.52, (-0.9, 2.5, 1.6, -1.25), f"{how} pixel centres")
         draw_camera(left, axis_names, letters=axis_letters)
         draw_direction(middle, label, to_camera=forwards, colour=colours[1])
         draw_pixels(right, first, colours[2])

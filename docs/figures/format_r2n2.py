@@ -2,7 +2,7 @@
 
 import matplotlib.pyplot as plt
 import numpy as np
-from format_drawing import AXIS_COLOURS, INK, OTHER, SAME, SHADE, arrow, panel
+from format_drawing import INK, OTHER, SAME, SHADE, arrow, draw_axis, panel, write
 
 
 def on_paper(points: np.ndarray) -> np.ndarray:
@@ -17,29 +17,27 @@ def position(azimuth: np.ndarray | float, elevation: np.ndarray | float) -> np.n
     return np.stack((np.cos(e) * np.cos(a), np.sin(e), np.cos(e) * np.sin(a)), -1)
 
 
-figure = plt.figure(figsize=(8.4, 3.9))
-axes = panel(figure, 0.2, 0.1, 1.45, (-1.3, 4.2, -0.95, 1.55))
+figure = plt.figure(figsize=(7.2, 3.4))
+axes = panel(figure, 0.1, 0.1, 1.28, (-1.3, 4.2, -0.95, 1.55))
 azimuth, elevation, distance = np.radians(42.0), np.radians(33.0), 1.75
 origin = np.zeros(2)
 for tip, letter in (((1.35, 0, 0), "x"), ((0, 1.2, 0), "y"), ((0, 0, 1.35), "z")):
-    arrow(axes, origin, on_paper(np.array(tip)), AXIS_COLOURS[letter], 1.3)
-    axes.text(*on_paper(1.1 * np.array(tip)), letter, color=AXIS_COLOURS[letter], fontweight="bold", ha="center", va="center")
+    draw_axis(axes, origin, on_paper(np.array(tip)), letter, width=1.3)
 corners = 0.24 * np.array([[-1, -1, -1], [1, -1, -1], [1, -1, 1], [-1, -1, 1], [-1, -1, -1]], float)
-for lift in (0.0, 0.48):
-    axes.plot(*on_paper(corners + (0, lift, 0)).T, color=SHADE, lw=1)
-for corner in corners[:4]:
-    axes.plot(*on_paper(np.stack((corner, corner + (0, 0.48, 0)))).T, color=SHADE, lw=1)
+raised = np.add(corners, (0, 0.48, 0))
+for outline in (corners, raised, *np.stack((corners, raised), 1)):
+    axes.plot(*on_paper(outline).T, color=SHADE, lw=1)
 
 camera = distance * position(azimuth, elevation)
 foot = camera * (1, 0, 1)
 arrow(axes, on_paper(camera), on_paper(0.3 * camera), SAME, 1.6)
-axes.plot(*np.stack((origin, on_paper(foot))).T, color=INK, lw=0.9, ls="--")
-axes.plot(*np.stack((on_paper(camera), on_paper(foot))).T, color=INK, lw=0.9, ls="--")
+for end in (origin, on_paper(camera)):
+    axes.plot(*np.stack((end, on_paper(foot))).T, color=INK, lw=0.9, ls="--")
 axes.plot(*on_paper(camera), "o", color=INK, ms=8, zorder=6)
-axes.text(*(on_paper(camera) + (0.1, 0.05)), "camera centre C,\nlooking at the origin", fontsize=9, color=INK, va="bottom")
+write(axes, on_paper(camera), "camera centre C,\nlooking at the origin", by=(0.1, 0.05), va="bottom")
 axes.plot(*on_paper(0.75 * position(np.linspace(0, azimuth, 30), 0.0)).T, color=OTHER, lw=1.6)
-axes.text(*(on_paper(0.75 * position(0.35 * azimuth, 0.0)) + (0.05, -0.1)), "azimuth a", fontsize=9, color=OTHER)
+write(axes, on_paper(0.75 * position(0.35 * azimuth, 0.0)), "azimuth a", OTHER, by=(0.05, -0.1))
 axes.plot(*on_paper(1.1 * position(azimuth, np.linspace(0, elevation, 30))).T, color=OTHER, lw=1.6)
-axes.text(*(on_paper(1.1 * position(azimuth, 0.75 * elevation)) + (0.1, -0.05)), "elevation e", fontsize=9, color=OTHER)
+write(axes, on_paper(1.1 * position(azimuth, 0.75 * elevation)), "elevation e", OTHER, by=(0.1, -0.05))
 axes.text(2.0, 0.3, r"$C = d\,(\cos e \cos a,\; \sin e,\; \cos e \sin a)$", fontsize=10.5, color=INK)
 axes.text(2.0, 0.0, r"$d = 1.75 \times$ the fourth number of the line", fontsize=9.5, color=INK)

@@ -2,10 +2,10 @@
 
 import matplotlib.pyplot as plt
 import numpy as np
-from format_drawing import AXIS_COLOURS, INK, OTHER, SAME, SHADE, arrow, panel
+from format_drawing import INK, OTHER, SAME, SHADE, arrow, draw_axis, panel
 
-figure = plt.figure(figsize=(8.4, 4.1))
-axes = panel(figure, 0.1, 0.05, 0.94, (-2.6, 6.2, -0.85, 3.5))
+figure = plt.figure(figsize=(7.2, 3.6))
+axes = panel(figure, 0.05, 0.05, 0.8, (-2.6, 6.2, -0.85, 3.5))
 baseline, plane, point = 2.4, 0.9, np.array([1.5, 3.1])
 for x, name, mark in ((0.0, "left camera (im0)", "x"), (baseline, "right camera (im1)", "x - d")):
     axes.plot([x - 0.75, x + 0.75], [plane, plane], color=SHADE, lw=2.4)
@@ -25,9 +25,8 @@ arrow(axes, np.array([-1.1, 0]), np.array([-1.1, point[1]]), SAME)
 axes.text(-1.2, 1.6, "depth Z", fontsize=9, color=SAME, ha="right", va="center")
 axes.plot([-1.25, 0], [0, 0], color=SAME, lw=0.8, ls="--")
 axes.plot([-1.25, point[0]], [point[1], point[1]], color=SAME, lw=0.8, ls="--")
-for end, letter, where in ((np.array([-1.65, 0.0]), "x", (0.1, 0)), (np.array([-2.3, 0.65]), "z", (0, 0.12))):
-    corner = np.array([-2.3, 0.0])
-    arrow(axes, corner, end, AXIS_COLOURS[letter])
-    axes.text(*(end + where), letter, color=AXIS_COLOURS[letter], fontsize=10, fontweight="bold", ha="center", va="center")
+corner = np.array([-2.3, 0.0])
+draw_axis(axes, corner, np.add(corner, (0.65, 0)), "x")
+draw_axis(axes, corner, np.add(corner, (0, 0.65)), "z")
 axes.text(3.6, 2.3, r"$Z = \frac{f\,B}{d + \mathrm{doffs}}$", fontsize=15, color=INK, va="center")
 axes.text(3.6, 1.65, r"$\mathrm{doffs} = c_{x1} - c_{x0}$", fontsize=11, color=INK, va="center")

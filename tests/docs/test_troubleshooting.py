@@ -1,0 +1,117 @@
+"""Each cure that the troubleshooting page shows undoes the mistake that it is shown for."""
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from lsmgeo import cameras
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "troubleshooting.rst"
+HEIGHT, WIDTH = 48, 64
+
+
+def cures() -> dict[str, str]:
+    """The code under each heading of the third rank."""
+    sections = re.split(r"\n([^\n]+)\n~{3,}\n", PAGE.read_text(encoding="utf-8"))
+    found = {}
+    for title, text in zip(sections[1::2], sections[2::2], strict=True):
+        text = re.split(r"\n[^\n]+\n-{3,}\n", text)[0]
+        block = re.search(r"\.\. code-block:: python\n\n((?:   .*\n|\n)+)", text)
+        if block:
+            found[title] = re.sub(r"(?m)^   ", "", block[1])
+    return found
+
+
+def right_cameras() -> cameras.CameraTensors:
+    azimuths = torch.tensor([10.0, 75.0, -40.0], dtype=torch.float64)
+    views = cameras.orbit(azimuths, 25.0, 2.0, focal_length=70.0, height=HEIGHT, width=WIDTH)
+    views = cameras.perturb(cameras.to(views, torch.float64), 5.0, generator=torch.Generator().manual_seed(0))
+    shift = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, -2.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    return views._replace(intrinsics=views.intrinsics + shift)
+
+
+def moved(views: cameras.CameraTensors, change: torch.Tensor) -> cameras.CameraTensors:
+    return views._replace(intrinsics=views.intrinsics + change.to(views.intrinsics))
+
+
+def posed(views: cameras.CameraTensors, R: torch.Tensor, t: torch.Tensor) -> cameras.CameraTensors:
+    E = views.cam_from_world.clone()
+    E[:, :3, :3], E[:, :3, 3] = R, t
+    return views._replace(cam_from_world=E)
+
+
+def planted(name: str, views: cameras.CameraTensors) -> cameras.CameraTensors:
+    """The mistake, written without the library's converters."""
+    E, K = views.cam_from_world, views.intrinsics
+    R, t = E[:, :3, :3], E[:, :3, 3]
+    if name == "poses inverted":
+        return posed(views, R.mT, -torch.einsum("vji,vj->vi", R, t))
+    if name == "OpenGL axes":
+        sign = torch.tensor([1.0, -1.0, -1.0], dtype=E.dtype)
+        return posed(views, sign[:, None] * R, sign * t)
+    if name == "y flipped":
+        sign = torch.tensor([1.0, -1.0, 1.0], dtype=E.dtype)
+        return posed(views, sign[:, None] * R * sign, sign * t)
+    if name == "half a pixel":
+        return moved(views, torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]))
+    if name == "K of another resolution":
+        half = K.clone()
+        half[:, :2] *= 0.5
+        half[:, :2, 2] -= 0.25  # (c + 1/2) / 2 - 1/2
+        return views._replace(intrinsics=half)
+    if name == "frames shuffled":
+        order = [2, 0, 1]
+        return views._replace(intrinsics=K[order], cam_from_world=E[order])
+    if name == "rotation transposed":
+        return posed(views, R.mT, t)
+    if name == "centre taken as translation":
+        return posed(views, R, -torch.einsum("vji,vj->vi", R, t))
+    if name == "focal length off":
+        return views._replace(intrinsics=K * torch.tensor([[2.0, 2.0, 1.0], [2.0, 2.0, 1.0], [1.0, 1.0, 1.0]]).to(K))
+    raise AssertionError(name)
+
+
+OF_CAMERAS = (
+    "poses inverted",
+    "OpenGL axes",
+    "y flipped",
+    "half a pixel",
+    "K of another resolution",
+    "frames shuffled",
+    "rotation transposed",
+    "centre taken as translation",
+    "focal length off",
+)
+
+
+@pytest.mark.parametrize("name", OF_CAMERAS)
+def test_the_cure_undoes_the_mistake(name):
+    expected = right_cameras()
+    names = {
+        "torch": torch,
+        "cameras": cameras,
+        "views": planted(name, expected),
+        "height": HEIGHT,
+        "width": WIDTH,
+        "names_of_cameras": ["c", "a", "b"],
+        "names_of_photographs": ["a", "b", "c"],
+    }
+    assert not torch.equal(names["views"].cam_from_world, expected.cam_from_world) or not torch.equal(
+        names["views"].intrinsics, expected.intrinsics
+    )
+    exec(compile(cures()[name], f"{PAGE}: {name}", "exec"), names)
+    for found, right in zip(names["views"], expected, strict=True):
+        torch.testing.assert_close(torch.as_tensor(found), torch.as_tensor(right).expand(torch.as_tensor(found).shape))
+
+
+def test_the_way_along_the_ray_becomes_depth():
+    views = right_cameras()
+    rows, columns = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    pixels = torch.stack((columns, rows, torch.ones_like(rows)), -1).double()
+    rays = torch.linalg.solve(views.intrinsics[:, None, None], pixels[..., None])[..., 0]  # z is 1
+    expected = torch.full((3, HEIGHT, WIDTH), 1.7, dtype=torch.float64)
+    names = {"cameras": cameras, "views": views, "depth": expected * rays.norm(dim=-1)}
+    exec(compile(cures()["depth along the ray"], str(PAGE), "exec"), names)
+    torch.testing.assert_close(names["depth"], expected)

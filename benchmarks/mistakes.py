@@ -1,0 +1,132 @@
+"""Mistakes that people make with cameras, planted in what was read; nothing here is shared with what finds them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from lsmgeo import VoxelGrid
+from lsmgeo.data import Calibration, PosedImages, Voxels
+
+__all__ = ["plants"]
+
+
+HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def _inverted(pose: np.ndarray) -> np.ndarray:
+    """Camera-to-world taken for world-to-camera."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
+
+
+def _opengl(pose: np.ndarray) -> np.ndarray:
+    """Cameras that look along -z with y up, taken for ones that look along z with y down."""
+    return HALF_TURN @ pose
+
+
+def _flipped(pose: np.ndarray) -> np.ndarray:
+    """Cameras and world of which y points the other way: a left-handed system taken for a right-handed one."""
+    return MIRROR @ pose @ MIRROR
+
+
+def _half_pixel(K: np.ndarray) -> np.ndarray:
+    """Half-integer pixel centres taken for integer ones."""
+    shift = np.zeros((3, 3))
+    shift[:2, 2] = 0.5
+    return K + shift
+
+
+def _other_resolution(K: np.ndarray) -> np.ndarray:
+    """K of pictures half as large."""
+    return np.diag([0.5, 0.5, 1.0]) @ K
+
+
+def _another(count: int) -> np.ndarray:
+    """An order that leaves nothing in its place, where there are more than three."""
+    rng = np.random.default_rng(0)
+    order = np.arange(count)[::-1] if count < 4 else rng.permutation(count)
+    while count >= 4 and (order == np.arange(count)).any():
+        order = rng.permutation(count)
+    return order
+
+
+POSES = {"poses inverted": _inverted, "OpenGL axes": _opengl, "y flipped": _flipped}
+INTRINSICS = {"half a pixel": _half_pixel, "K of another resolution": _other_resolution}
+
+
+def plants(content: Any) -> dict[str, Callable[[], Any]]:
+    """What was read, with each of the mistakes that can be made with it.
+
+    Args:
+        content: posed photographs, voxels or a calibration.
+
+    Returns:
+        By name of the mistake, a call that gives the content with it.
+    """
+    if isinstance(content, PosedImages):
+        made: dict[str, Callable[[], Any]] = {}
+        for name, change in (POSES | INTRINSICS).items():
+            field = "cam_from_world" if name in POSES else "intrinsics"
+            made[name] = lambda field=field, change=change: _with_cameras(content, field, change)
+        return made | {"frames shuffled": lambda: _shuffled(content)}
+    if isinstance(content, Voxels):
+        side = content.grid.world_from_lattice[0, 0].item() * content.occupancy.shape[0]
+        centred = VoxelGrid(content.occupancy.shape, -side / 2, side / 2)
+        return {
+            "voxels placed otherwise": lambda: content._replace(grid=centred),
+            "axes of the voxels exchanged or flipped": lambda: content._replace(
+                occupancy=content.occupancy.permute(2, 1, 0).contiguous()
+            ),
+        }
+    if isinstance(content, Calibration):
+        made = {name: lambda change=change: _with_views(content, change) for name, change in POSES.items()}
+        made |= {name: lambda change=change: _with_lenses(content, change) for name, change in INTRINSICS.items()}
+        return made | {"frames shuffled": lambda: _shuffled_pairs(content)}
+    raise TypeError(f"nothing is known of mistakes with {type(content)}")
+
+
+def _with_cameras(scene: PosedImages, field: str, change: Callable[[np.ndarray], np.ndarray]) -> PosedImages:
+    matrices = getattr(scene.cameras, field).double().numpy()
+    changed = torch.from_numpy(np.stack([change(matrix) for matrix in matrices]))
+    return replace(scene, cameras=scene.cameras._replace(**{field: changed}))
+
+
+def _shuffled(scene: PosedImages) -> PosedImages:
+    """Every photograph, with its depth, beside the camera of another one."""
+    order = _another(len(scene))
+    names, paths = ([items[index] for index in order] for items in (scene.names, scene.paths))
+    depths = None if scene.depths is None else tuple(scene.depths[index] for index in order)
+    return replace(scene, names=tuple(names), paths=tuple(paths), depths=depths)
+
+
+def _with_lenses(calibration: Calibration, change: Callable[[np.ndarray], np.ndarray]) -> Calibration:
+    lenses = {name: replace(lens, intrinsics=change(lens.intrinsics)) for name, lens in calibration.lenses.items()}
+    return replace(calibration, lenses=lenses)
+
+
+def _with_views(calibration: Calibration, change: Callable[[np.ndarray], np.ndarray]) -> Calibration:
+    lenses = {}
+    for name, lens in calibration.lenses.items():
+        rows = []
+        for row in [] if lens.views is None else lens.views:
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(row[:3])[0], row[3:]
+            pose = change(pose)
+            rows.append(np.concatenate([cv2.Rodrigues(pose[:3, :3])[0][:, 0], pose[:3, 3]]))
+        lenses[name] = replace(lens, views=np.stack(rows)) if rows else lens
+    return replace(calibration, lenses=lenses)
+
+
+def _shuffled_pairs(calibration: Calibration) -> Calibration:
+    """The second camera's pictures in another order."""
+    first, second = calibration.pictures
+    return replace(calibration, pictures=(first, tuple(second[index] for index in _another(len(second)))))

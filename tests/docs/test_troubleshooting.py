@@ -1,5 +1,6 @@
 """Each cure that the troubleshooting page shows undoes the mistake that it is shown for."""
 
+import ast
 import re
 from pathlib import Path
 
@@ -70,6 +71,12 @@ def planted(name: str, views: cameras.CameraTensors) -> cameras.CameraTensors:
         return posed(views, R, -torch.einsum("vji,vj->vi", R, t))
     if name == "focal length off":
         return views._replace(intrinsics=K * torch.tensor([[2.0, 2.0, 1.0], [2.0, 2.0, 1.0], [1.0, 1.0, 1.0]]).to(K))
+    if name == "translation negated":
+        return posed(views, R, -t)
+    if name == "other camera axes":  # forward, left, up
+        return posed(
+            views, torch.stack((R[:, 2], -R[:, 0], -R[:, 1]), 1), torch.stack((t[:, 2], -t[:, 0], -t[:, 1]), 1)
+        )
     raise AssertionError(name)
 
 
@@ -83,7 +90,25 @@ OF_CAMERAS = (
     "rotation transposed",
     "centre taken as translation",
     "focal length off",
+    "translation negated",
+    "other camera axes",
 )
+
+
+def literals() -> set[str]:
+    """All texts in the code that finds mistakes."""
+    files = (PAGE.parents[1] / "lsmgeo" / "diagnosis").glob("*.py")
+    trees = [ast.parse(file.read_text(encoding="utf-8")) for file in files]
+    nodes = [node for tree in trees for node in ast.walk(tree)]
+    return {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+
+
+def test_the_page_has_the_names_that_are_given():
+    text = PAGE.read_text(encoding="utf-8")
+    titles = set(re.findall(r"\n([^\n]+)\n~{3,}\n", text)) - {"Calibrations and voxels"}
+    assert set(OF_CAMERAS) < titles
+    assert titles <= literals()
+    assert set(re.findall(r'"([^"]+)" (?:says|is the other)', text)) <= literals()
 
 
 @pytest.mark.parametrize("name", OF_CAMERAS)

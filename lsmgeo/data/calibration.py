@@ -116,7 +116,8 @@ def read_calibration(path: str | Path) -> Calibration:
     (https://docs.opencv.org, tutorial "Camera calibration With OpenCV" and samples calibration and stereo_calib.)
 
     All files of a folder are taken together, as a rig's lenses, its R and T and the list of its pictures usually lie in
-    three; nothing may be stated twice. Pictures of a list that are not there are left out, with their partner.
+    three; nothing may be stated twice. Pictures of a list that are not there are left out, with their partner. A JSON
+    file is looked at where it holds a matrix of OpenCV's.
 
     Convention:
         OpenCV's, which is ours; nothing is changed.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -25,6 +26,8 @@ MAX_STORAGE_BYTES = 1 << 22
 MEMORY = 1 << 30
 SECONDS = 30.0
 SUFFIXES = (".yml", ".yaml", ".xml", ".json")
+MATRIX = re.compile(rb"opencv-(nd-)?matrix")
+PICTURE = re.compile(rb"\.(png|jpe?g)\b", re.IGNORECASE)
 BEYOND = 1e12
 
 
@@ -37,14 +40,16 @@ class Entries(NamedTuple):
 
 
 def is_storage(path: Path) -> bool:
-    """Whether a file looks like one that FileStorage wrote and that holds matrices or texts."""
+    """Whether a file looks like one that FileStorage wrote: it holds its matrices, or, but for JSON, names pictures."""
     if path.suffix.lower() not in SUFFIXES or not path.is_file():
         return False
     with path.open("rb") as stream:
         start = stream.read(1 << 16).lstrip(b"\xef\xbb\xbf \t\r\n")
     if path.suffix.lower() == ".xml":
         return b"<opencv_storage>" in start
-    return (start.startswith(b"%YAML") or start.startswith(b"{")) and b"opencv-matrix" in start
+    if path.suffix.lower() == ".json":
+        return start.startswith(b"{") and MATRIX.search(start) is not None
+    return start.startswith(b"%YAML") and (MATRIX.search(start) or PICTURE.search(start)) is not None
 
 
 def read_storages(paths: Sequence[Path]) -> list[Entries | DataError]:

@@ -26,6 +26,12 @@ def _number(node: Any) -> float | int | None:
 def _matrix(node: Any) -> dict[str, Any] | None:
     data = node.getNode("data")
     rows, columns = (_number(node.getNode(name)) for name in ("rows", "cols"))
+    sizes = node.getNode("sizes")
+    if sizes.isSeq() and sizes.size() in (1, 2):
+        # OpenCV 5 writes vectors so.
+        rows, columns = _number(sizes.at(0)), _number(sizes.at(1)) if sizes.size() == 2 else 1
+    elif sizes.isInt():  # the same as XML
+        rows, columns = _number(sizes), 1
     if rows is None or columns is None or not data.isSeq() or data.size() > MOST_VALUES:
         return None
     # The numbers as they stand, not `node.mat()`: that one allocates what rows and columns ask for.
@@ -71,7 +77,7 @@ def main() -> None:
             raise
         # OpenCV's binding raises SystemError for what it cannot parse, and cv2.error for the rest.
         except Exception as error:
-            answer = {"error": f"{type(error).__name__}: {error}"[:200]}
+            answer = {"error": str(error.__cause__ or error)[:200]}
         sys.stdout.write(json.dumps(answer) + "\n")
         sys.stdout.flush()
 

@@ -36,6 +36,7 @@ MOST_PICTURES = 60
 LIMIT = 1.0
 # Resolutions that are made from each other.
 SCALES = tuple(sorted({a / b for a in (1, 2, 3, 4, 8) for b in (1, 2, 3, 4, 8)} - {1.0}))
+EXCHANGE = "The first lens is that of the second pictures: exchange lenses or pictures."
 OPENGL, FLIP = np.diag([1.0, -1.0, -1.0]), np.diag([1.0, -1.0, 1.0])
 
 Pairs = list[tuple[np.ndarray, np.ndarray]]
@@ -102,7 +103,11 @@ def examine_calibration(calibration: Calibration, path: Path) -> Findings:
 def _concluded(report: _Report) -> Findings:
     # Of several mistakes the first: pictures come before lenses, and these before rigs, which are measured with them.
     cause = report.causes[0] if report.causes else None
-    others = [f"Also {cause.name}: {cause.evidence}. {cause.remedy}" for cause in report.causes[1:]]
+    others = [
+        f"Also {other.name}: {other.evidence}. {other.remedy}"
+        for other in report.causes[1:]
+        if cause is not None and other.name != cause.name
+    ]
     return Findings(tuple(report.facts), tuple(report.checks), cause, (*report.remarks, *others))
 
 
@@ -235,8 +240,7 @@ def _examine_lenses(calibration: Calibration, scene: _Scene, report: _Report) ->
         ]
         if max(swapped) <= LIMIT:
             evidence = f"exchanged, the lenses see the corners to {max(swapped):.3g} px"
-            remedy = "The first lens is that of the second pictures: exchange lenses or pictures."
-            report.causes.append(Cause("left and right exchanged", evidence, remedy))
+            report.causes.append(Cause("left and right exchanged", evidence, EXCHANGE))
             return good
     for name, lens in failed.items():
         _explain_lens(name, lens, scene, sides[name], report)
@@ -246,7 +250,10 @@ def _examine_lenses(calibration: Calibration, scene: _Scene, report: _Report) ->
 def _explain_lens(name: str, lens: CalibratedLens, scene: _Scene, side: int, report: _Report) -> None:
     seen = scene.seen[side]
     stated = rms(board_errors(lens, scene.points, seen.found))
-    resized = [(rms(board_errors(_scaled(lens, scale), scene.points, seen.found)), scale) for scale in SCALES]
+    scales = list(SCALES)
+    if scene.lenses:
+        scales.append(float(scene.lenses[side].intrinsics[0, 0] / lens.intrinsics[0, 0]))
+    resized = [(rms(board_errors(_scaled(lens, scale), scene.points, seen.found)), scale) for scale in scales]
     error, scale = min(resized, key=lambda pair: np.nan_to_num(pair[0], nan=np.inf))
     if error <= LIMIT and error < 0.5 * stated:
         evidence = (
@@ -286,6 +293,12 @@ def _other_poses(pose: Pose) -> list[tuple[str, str, str, Pose]]:
     return [
         ("poses inverted", "inverted", "R and T lead the other way: use R^T and -R^T T.", pose.inverse()),
         ("OpenGL axes", "with y and z negated", "The axes are OpenGL's: negate y and z on both sides.", turned(OPENGL)),
+        (
+            "OpenGL axes",
+            "with the camera's y and z negated",
+            "The camera's axes are OpenGL's: negate y and z of the camera.",
+            Pose(OPENGL @ pose.R, OPENGL @ pose.t),
+        ),
         ("y flipped", "with y negated", "y points up: negate it on both sides of R and in T.", turned(FLIP)),
         ("rotation transposed", "with R transposed", "Transpose R.", Pose(pose.R.T, pose.t)),
         ("translation negated", "with T negated", "T has the wrong sign: negate it.", Pose(pose.R, -pose.t)),
@@ -313,15 +326,19 @@ def _examine_rig(
             "T or the square's size is in other units."
         )
 
-    def error_of(pose: Pose) -> float:
+    def error_of(pose: Pose, used: tuple[CalibratedLens, CalibratedLens] = (first, second)) -> float:
         # The pictures do not tell lengths, so T gets the one that was measured.
         placed = Pose(pose.R, pose.t * (measured / length))
-        return rms(transfer_errors(placed, scene.points, (first, second), pairs))
+        return rms(transfer_errors(placed, scene.points, used, pairs))
 
     stated = Pose(rig.rotation, rig.translation)
     error = error_of(stated)
     check = Check("rms of corners carried by the rig", error, "px", LIMIT, len(pairs) * len(scene.points), "corners")
     report.checks.append(check)
+    if error > LIMIT and (exchanged := error_of(stated, (second, first))) < min(LIMIT, 0.5 * error):
+        evidence = f"with the lenses exchanged, the rms of corners carried by the rig falls to {exchanged:.3g} px"
+        report.causes.append(Cause("left and right exchanged", f"{evidence} from {error:.3g} px", EXCHANGE))
+        return
     _explain_pose(stated, error, error_of, "corners carried by the rig", report)
 
 

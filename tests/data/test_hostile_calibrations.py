@@ -1,0 +1,187 @@
+"""Calibrations that lie: a DataError that names the file; their parser runs in a process that may die."""
+
+import gzip
+import os
+
+import numpy as np
+import pytest
+
+from lsmgeo import data
+from lsmgeo.data import calibration, storage
+from lsmgeo.data.storage import read_storages
+from lsmgeo.errors import DataError
+from tests.data.hostile import judged, mutated
+from tests.data.test_calibration import YAML, write_rig, write_storage
+
+pytestmark = pytest.mark.timeout(120)
+HEAD = "%YAML:1.0\n---\n"
+LENS = YAML.removeprefix(HEAD)
+
+
+def matrix(name, values, rows=3, columns=3):
+    return f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {values} ]\n"
+
+
+XML = '<?xml version="1.0"?>\n<opencv_storage>\n{}\n</opencv_storage>\n'
+IDENTITY = "1., 0., 0., 0., 1., 0., 0., 0., 1."
+SHIFT = matrix("T", "0., 0., 1.", 3, 1)
+ATTACKS = [
+    ("a.yml", "", "no file of OpenCV"),
+    ("a.yml", HEAD, "states no camera matrix|no file of OpenCV"),
+    ("a.yml", "/etc/passwd", "no file of OpenCV"),
+    ("a.yml", "/etc/passwd?base64", "no file of OpenCV"),
+    ("a.yml", HEAD + "camera_matrix: [ [ [ [", "no file of OpenCV"),
+    ("a.xml", XML.format("<a>" * 100_000), "no file of OpenCV|crashed|memory|made its parser"),
+    ("a.json", '{"a":' * 100_000, "no file of OpenCV|crashed|memory|made its parser"),
+    ("a.yml", HEAD + matrix("camera_matrix", "1.", 2**30, 2**30), "states no camera matrix"),
+    ("a.yml", HEAD + matrix("camera_matrix", "1.", -3, -3), "states no camera matrix"),
+    ("a.yml", HEAD + matrix("camera_matrix", IDENTITY, 1, 9), "must be 3 x 3"),
+    ("a.yml", HEAD + matrix("camera_matrix", "1., " * 200_000 + "1."), "states no camera matrix"),
+    ("a.yml", HEAD + matrix("camera_matrix", IDENTITY.replace("1., 0.", ".Nan, 0.", 1)), "finite"),
+    ("a.yml", HEAD + matrix("camera_matrix", IDENTITY.replace("1., 0.", ".Inf, 0.", 1)), "finite"),
+    ("a.yml", HEAD + matrix("camera_matrix", IDENTITY.replace("1., 0.", "1e9, 0.", 1)), "beyond"),
+    ("a.yml", HEAD + matrix("camera_matrix", IDENTITY.replace("1., 0.", "-1., 0.", 1)), "positive"),
+    ("a.yml", HEAD + matrix("camera_matrix", "1., 0., 0., 0., 1., 0., 1., 0., 1."), "upper triangular"),
+    ("a.yml", HEAD + matrix("camera_matrix", IDENTITY.replace("1., 0.", "1., 0.5", 1)), "skew"),
+    ("a.yml", HEAD + LENS.replace("rows: 5", "rows: 6").replace("0.24", "0.24, 1."), "coefficients of distortion"),
+    ("a.yml", HEAD + LENS.replace("0.24", "1e9"), "coefficient of distortion beyond"),
+    ("a.yml", HEAD + LENS + matrix("M", IDENTITY), "mean the same"),
+    ("a.yml", HEAD + LENS + matrix("Camera_Matrix", IDENTITY), "capitals or underscores"),
+    ("a.yml", HEAD + LENS + matrix("camera_matrix", IDENTITY), "one twice|no file"),
+    ("a.yml", HEAD + LENS.replace("640", "6.5"), "whole numbers"),
+    ("a.yml", HEAD + LENS.replace("640", "2000000"), "whole numbers"),
+    ("a.yml", HEAD + LENS.replace("board_width: 9", "board_width: 1"), "2 corners"),
+    ("a.yml", HEAD + LENS.replace("board_width: 9", "board_width: 100000"), "whole numbers"),
+    ("a.yml", HEAD + LENS.replace("2.5e-02", "-1"), "positive"),
+    ("a.yml", HEAD + LENS.replace("cols: 6", "cols: 4").replace("rows: 2", "rows: 3"), "6 columns"),
+    ("a.yml", HEAD + matrix("R", IDENTITY) + matrix("T", "0., 0.", 2, 1), "T three numbers"),
+    ("a.yml", HEAD + matrix("R", "2., 0., 0., 0., 2., 0., 0., 0., 2.") + SHIFT, "scaled by 2"),
+    ("a.yml", HEAD + matrix("R", IDENTITY[:-2] + "-1.") + SHIFT, "mirrored"),
+    ("a.yml", HEAD + matrix("R", "9e9, 0., 0.", 3, 1) + SHIFT, "more than a turn"),
+    ("a.xml", XML.format("<l>\n../left.jpg ../right.jpg</l>"), "outside its folder"),
+    ("a.xml", XML.format("<l>\n/etc/a.jpg /etc/b.jpg</l>"), "outside its folder"),
+    ("a.xml", XML.format("<l>\na.jpg a.jpg</l>"), "twice"),
+    ("a.xml", XML.format("<l>\na.jpg b.jpg</l><m>\nc.jpg d.jpg</m>"), "lists pictures"),
+    ("a.xml", '<!DOCTYPE a [<!ENTITY x SYSTEM "/etc/passwd">]>\n' + XML.format("<a>&x;</a>"), "no file of OpenCV"),
+    ("a.json", '{"camera_matrix": {"type_id": "opencv-matrix", "rows": 3}}', "states no camera matrix"),
+    ("a.yml", HEAD + LENS + "\0", "zero byte"),
+    ("a.yml", HEAD + "# " + "x" * (1 << 22), "larger than"),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def parsed(tmp_path_factory):
+    """Every attack's file and what the parser makes of it: one process reads all but those that kill it."""
+    root = tmp_path_factory.mktemp("attacks")
+    paths = []
+    for index, (name, content, _) in enumerate(ATTACKS):
+        paths.append(root / str(index) / name)
+        paths[-1].parent.mkdir()
+        paths[-1].write_text(content)
+    return list(zip(paths, read_storages(paths), strict=True))
+
+
+@pytest.mark.parametrize("index", range(len(ATTACKS)))
+def test_calibrations_are_checked(parsed, monkeypatch, index):
+    path, entries = parsed[index]
+    monkeypatch.setattr(calibration, "read_storages", lambda _: [entries])
+    with pytest.raises(DataError, match=ATTACKS[index][2]) as caught:
+        data.read_calibration(path)
+    assert str(caught.value.path) == str(path)
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_nesting_without_end_kills_the_parser_alone(tmp_path):
+    (tmp_path / "a.yml").write_text(HEAD + "camera_matrix: " + "[" * 100_000)
+    with pytest.raises(DataError, match=r"crashed its parser|made its parser fail|no file of OpenCV"):
+        data.read_calibration(tmp_path / "a.yml")
+
+
+def test_files_that_state_the_same_are_named(tmp_path):
+    folder = write_rig(tmp_path)
+    (folder / "other.yml").write_bytes((folder / "intrinsics.yml").read_bytes())
+    with pytest.raises(DataError, match=r"states the lens 'first', and so does intrinsics\.yml"):
+        data.read_calibration(folder)
+    (folder / "other.yml").write_bytes((folder / "extrinsics.yml").read_bytes())
+    with pytest.raises(DataError, match=r"states R and T, and so does extrinsics\.yml"):
+        data.read_calibration(folder)
+    for name, width in (("other.yml", 9), ("third.yml", 8)):
+        write_storage(folder / name, board_width=width, board_height=6, camera_matrix=np.eye(3))
+    with pytest.raises(DataError, match="another file"):
+        data.read_calibration(folder)
+
+
+def test_compressed_files_pipes_and_links_are_not_followed(tmp_path):
+    (tmp_path / "a.yml").write_bytes(gzip.compress(YAML.encode()))
+    with pytest.raises(DataError, match="invalid UTF-8"):
+        data.read_calibration(tmp_path / "a.yml")
+    os.mkfifo(tmp_path / "b.yml")
+    with pytest.raises(DataError, match="no such file"):
+        data.read_calibration(tmp_path / "b.yml")
+    folder = write_rig(tmp_path / "rig")
+    (folder / "left00.png").rename(tmp_path / "left00.png")
+    (folder / "left00.png").symlink_to(tmp_path / "left00.png")
+    with pytest.raises(DataError, match="outside its folder"):
+        data.read_calibration(folder)
+
+
+def test_a_file_that_kills_its_parser_harms_no_other(tmp_path, monkeypatch):
+    worker = tmp_path / "worker.py"
+    worker.write_text(
+        "import os, struct, sys\n"
+        "while header := sys.stdin.buffer.read(4):\n"
+        "    content = sys.stdin.buffer.read(*struct.unpack('<I', header))\n"
+        "    if b'bad' in content:\n"
+        "        os.abort()\n"
+        '    print(\'{"entries": [["a", 1.5]]}\', flush=True)\n'
+    )
+    monkeypatch.setattr(storage, "WORKER", worker)
+    paths = []
+    for index, content in enumerate(("good", "bad", "good")):
+        paths.append(tmp_path / f"{index}.yml")
+        paths[-1].write_text(content)
+    first, second, third = read_storages(paths)
+    assert first.numbers == third.numbers == {"a": 1.5}
+    assert str(second) == f"{paths[1]}: crashed its parser (SIGABRT)"
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [b"", b"[]", b"{}", b'{"entries": 1}', b'{"entries": [[1, 2]]}', b'{"entries": [["a", {"rows": 1}]]}',
+     b'{"entries": [["a", {"rows": 2, "columns": 1, "values": ["x", null]}]]}', b'{"entries": [["a", 1e999]]}',
+     b'{"entries": [["a", NaN]]}', b'{"entries": [["a", true]]}', b'{"entries": [["a"]]}', b"[" * 99_999,
+     b'{"error": "\\u001b[31m"}'],
+)  # fmt: skip
+def test_a_parser_that_was_taken_over_is_not_believed(tmp_path, monkeypatch, answer):
+    worker = tmp_path / "worker.py"
+    worker.write_text(f"import sys\nsys.stdin.buffer.read()\nsys.stdout.buffer.write({answer!r} + b'\\n')\n")
+    monkeypatch.setattr(storage, "WORKER", worker)
+    (tmp_path / "a.yml").write_text(YAML)
+    (result,) = read_storages([tmp_path / "a.yml"])
+    assert isinstance(result, DataError)
+    assert result.path == tmp_path / "a.yml"
+    assert str(result).isprintable()
+
+
+@pytest.mark.parametrize("ending", ["yml", "xml", "json"])
+def test_damaged_calibrations_give_a_data_error_or_a_calibration(tmp_path, monkeypatch, ending):
+    trials = 2000 if ending == "yml" else 700
+    rng = np.random.default_rng(0)
+    source = tmp_path / f"source.{ending}"
+    write_storage(source, camera_matrix=np.eye(3), D=np.full(5, 0.25), R=np.eye(3), T=np.ones(3), image_width=64,
+                  image_height=48, board_width=9, board_height=6, square_size=0.5, list=["a.png", "b.png"],
+                  extrinsic_parameters=np.ones((2, 6)))  # fmt: skip
+    original = source.read_bytes()
+    folder = tmp_path / "mutations"
+    folder.mkdir()
+    paths = [folder / f"{index}.{ending}" for index in range(trials)]
+    for path in paths:
+        path.write_bytes(mutated(rng, original))
+    before = sorted(tmp_path.rglob("*"))
+    verdicts = []
+    for path, entries in zip(paths, read_storages(paths), strict=True):
+        monkeypatch.setattr(calibration, "read_storages", lambda _, entries=entries: [entries])
+        verdicts.append(judged(lambda path=path: data.read_calibration(path)))
+    assert set(verdicts) == {"read", "refused"}
+    assert verdicts.count("refused") > trials // 20
+    assert sorted(tmp_path.rglob("*")) == before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import warnings
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 __all__ = ["read_npy"]
+
+MOST_SIDES = 8
 
 
 def read_npy(path: Path, limit: int) -> np.ndarray:
@@ -44,11 +47,13 @@ def read_npy(path: Path, limit: int) -> np.ndarray:
     except Exception as error:
         raise DataError(path, f"is not a .npy array ({str(error)[:120]})") from error
     if dtype.kind != "f" or dtype.itemsize not in (4, 8):
-        raise DataError(path, f"must hold float32 or float64; got {dtype}")
-    number = 1
-    for length in shape:
-        number *= int(length)
-    if min(shape, default=1) < 0 or number * dtype.itemsize != len(content) - stream.tell():
-        raise DataError(path, f"states an array of {shape} and holds {len(content) - stream.tell()} bytes of it")
+        raise DataError(path, f"must hold float32 or float64; got {str(dtype)[:80]}")
+    held = len(content) - stream.tell()
+    # Each side first: a product, and a message with it, would hold numbers of any length.
+    if len(shape) > MOST_SIDES or not all(0 <= side <= held for side in shape):
+        raise DataError(path, f"states more sides, or longer ones, than its {held} bytes of data can have")
+    number = math.prod(shape)
+    if number * dtype.itemsize != held:
+        raise DataError(path, f"states an array of {shape} and holds {held} bytes of it")
     values = np.frombuffer(content, dtype, number, stream.tell())
     return values.reshape(shape, order="F" if by_columns else "C").astype(np.float64)

@@ -21,7 +21,7 @@ def trimmed(scene: Scene) -> list[np.ndarray]:
     """The photographs, each of another size."""
     height, width = scene.size
     return [
-        image[: height - rows, : width - columns] for image, (rows, columns) in zip(scene.images, TRIMS, strict=True)
+        image[: height - rows, : width - columns] for image, (rows, columns) in zip(scene.images, TRIMS, strict=False)
     ]
 
 

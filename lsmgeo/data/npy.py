@@ -50,8 +50,8 @@ def read_npy(path: Path, limit: int) -> np.ndarray:
         raise DataError(path, f"must hold float32 or float64; got {str(dtype)[:80]}")
     held = len(content) - stream.tell()
     # Each side first: a product, and a message with it, would hold numbers of any length.
-    if len(shape) > MOST_SIDES or not all(0 <= side <= held for side in shape):
-        raise DataError(path, f"states more sides, or longer ones, than its {held} bytes of data can have")
+    if len(shape) > MOST_SIDES or not all(0 <= side <= len(content) for side in shape):
+        raise DataError(path, f"states more sides, or longer ones, than its {len(content)} bytes can hold")
     number = math.prod(shape)
     if number * dtype.itemsize != held:
         raise DataError(path, f"states an array of {shape} and holds {held} bytes of it")

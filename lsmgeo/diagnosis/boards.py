@@ -34,6 +34,8 @@ USUAL_BOARD = (9, 6)
 MOST_PICTURES = 60
 # A calibration of sharp pictures reaches 0.1 to 0.5 px; one of other pictures misses by several.
 LIMIT = 1.0
+# Pixels, and multiples of what a calibration from scratch leaves, up to which a lens is not looked at further.
+DOUBT, DOUBTS = 0.25, 4.0
 # Resolutions that are made from each other.
 SCALES = tuple(sorted({a / b for a in (1, 2, 3, 4, 8) for b in (1, 2, 3, 4, 8)} - {1.0}))
 EXCHANGE = "The first lens is that of the second pictures: exchange lenses or pictures."
@@ -78,7 +80,8 @@ def examine_calibration(calibration: Calibration, path: Path) -> Findings:
         path: from where, for what is said to the reader.
 
     Returns:
-        The findings. A mistake is named where undoing it brings an error from above 1 px to below, and to a half.
+        The findings. A mistake is named where undoing it brings an error from above 1 px, or from four times what the
+        pictures allow, to below, and to a half.
 
     Raises:
         DataError: a picture is damaged.
@@ -163,7 +166,7 @@ def _pairs(scene: _Scene) -> Pairs:
 
 def _examine_pictures(scene: _Scene, report: _Report) -> Pairs:
     """Calibrate from scratch; the pairs of corners, which are those of the list unless it was shuffled."""
-    for error, side, lens in zip(scene.errors, scene.seen, scene.lenses, strict=True):
+    for error, side, lens in zip(scene.errors, scene.seen, scene.lenses, strict=False):
         what = "rms of a calibration from scratch"
         if len(scene.seen) == 1:
             report.checks.append(Check(what, error, "px", LIMIT, len(side.found) * len(scene.points), "corners"))
@@ -216,7 +219,7 @@ def _examine_lenses(calibration: Calibration, scene: _Scene, report: _Report) ->
     """Compare each stated lens with its pictures; the good ones of a pair, by camera."""
     good: dict[int, CalibratedLens] = {}
     sides: dict[str, int] = {}
-    bad: set[str] = set()
+    off: dict[str, float] = {}
     for name, lens in calibration.lenses.items():
         errors = [rms(board_errors(lens, scene.points, side.found)) for side in scene.seen]
         # A lens of its own file may be of either camera; one of a pair says of which.
@@ -227,35 +230,37 @@ def _examine_lenses(calibration: Calibration, scene: _Scene, report: _Report) ->
         of = ("first", "second")[side] + " camera's corners" if len(errors) > 1 else "corners"
         report.checks.append(Check(f"rms under the lens {name}", errors[side], "px", LIMIT, count, of))
         report.facts.append((f"lens {name} on its pictures", _lens_text(lens, scene.seen[side].size)))
-        if errors[side] <= LIMIT:
+        if _is_right(errors[side], scene, side):
             good[side] = good.get(side, lens)
         else:
-            bad.add(name)
-    failed = {name: lens for name, lens in calibration.lenses.items() if name in bad}
-    if {"first", "second"} <= set(failed) and len(scene.seen) > 1:
-        first, second = calibration.lenses["first"], calibration.lenses["second"]
-        swapped = [
-            rms(board_errors(lens, scene.points, side.found))
-            for lens, side in zip((second, first), scene.seen, strict=True)
-        ]
-        if max(swapped) <= LIMIT:
-            evidence = f"exchanged, the lenses see the corners to {max(swapped):.3g} px"
+            off[name] = errors[side]
+    if {"first", "second"} <= set(off) and len(scene.seen) > 1:
+        both = zip(("second", "first"), scene.seen, strict=True)
+        swapped = [rms(board_errors(calibration.lenses[name], scene.points, side.found)) for name, side in both]
+        if all(_is_right(error, scene, side) for side, error in enumerate(swapped)):
+            stated = max(off["first"], off["second"])
+            evidence = f"exchanged, the rms under the lenses falls from {stated:.3g} px to {max(swapped):.3g} px"
             report.causes.append(Cause("left and right exchanged", evidence, EXCHANGE))
             return good
-    for name, lens in failed.items():
-        _explain_lens(name, lens, scene, sides[name], report)
+    for name, stated in off.items():
+        _explain_lens(name, calibration.lenses[name], stated, scene, sides[name], report)
     return good
 
 
-def _explain_lens(name: str, lens: CalibratedLens, scene: _Scene, side: int, report: _Report) -> None:
+def _is_right(error: float, scene: _Scene, side: int) -> bool:
+    """Whether a lens is as good as its pictures let one be: a board's pose hides much of what is wrong with K."""
+    anew = scene.errors[side] if scene.errors else LIMIT
+    return error <= LIMIT and error <= max(DOUBT, DOUBTS * anew)
+
+
+def _explain_lens(name: str, lens: CalibratedLens, stated: float, scene: _Scene, side: int, report: _Report) -> None:
     seen = scene.seen[side]
-    stated = rms(board_errors(lens, scene.points, seen.found))
     scales = list(SCALES)
     if scene.lenses:
         scales.append(float(scene.lenses[side].intrinsics[0, 0] / lens.intrinsics[0, 0]))
     resized = [(rms(board_errors(_scaled(lens, scale), scene.points, seen.found)), scale) for scale in scales]
     error, scale = min(resized, key=lambda pair: np.nan_to_num(pair[0], nan=np.inf))
-    if error <= LIMIT and error < 0.5 * stated:
+    if _is_right(error, scene, side) and error < 0.5 * stated and not 0.95 < scale < 1.05:
         evidence = (
             f"with K times {scale:.4g}, the rms under the lens {name} falls from {stated:.3g} px to {error:.3g} px"
         )
@@ -264,7 +269,7 @@ def _explain_lens(name: str, lens: CalibratedLens, scene: _Scene, side: int, rep
             "scale K by that (c becomes (c + 0.5) s - 0.5), or use pictures of the calibrated size."
         )
         report.causes.append(Cause("K of another resolution", evidence, remedy))
-    elif scene.errors and scene.errors[side] < min(LIMIT, 0.5 * stated):
+    elif stated > LIMIT and scene.errors and scene.errors[side] < min(LIMIT, 0.5 * stated):
         bent, fitted = distortion_at_corners(lens, seen.size), distortion_at_corners(scene.lenses[side], seen.size)
         evidence = (
             f"calibrated anew from the pictures, the rms under the lens {name} falls from {stated:.3g} px to "
@@ -314,32 +319,37 @@ def _examine_rig(
     first, second = lenses
     if rig is None or first is None or second is None:
         return
-    stereo = calibrate_stereo(scene.points, (first, second), pairs, scene.seen[0].size)
     length = float(np.linalg.norm(rig.translation))
-    if stereo is None or length == 0:
+    stated = Pose(rig.rotation, rig.translation)
+
+    def measured_with(used: tuple[CalibratedLens, CalibratedLens]) -> float:
+        stereo = calibrate_stereo(scene.points, used, pairs, scene.seen[0].size)
+        return float("nan") if stereo is None else float(np.linalg.norm(stereo.rig.t))
+
+    def error_of(pose: Pose, used: tuple[CalibratedLens, CalibratedLens], measured: float) -> float:
+        # The pictures do not tell lengths, so T gets the one that was measured.
+        return rms(transfer_errors(Pose(pose.R, pose.t * (measured / length)), scene.points, used, pairs))
+
+    measured = measured_with((first, second))
+    if not measured > 0 or length == 0:
         return
-    measured = float(np.linalg.norm(stereo.rig.t))
     square = None if calibration.board is None else calibration.board.square
     if square is not None and not 0.95 < length / square / measured < 1.05:
         report.remarks.append(
             f"T is {length:.6g} long, which would be {length / square:.4g} squares; {measured:.4g} are measured: "
             "T or the square's size is in other units."
         )
-
-    def error_of(pose: Pose, used: tuple[CalibratedLens, CalibratedLens] = (first, second)) -> float:
-        # The pictures do not tell lengths, so T gets the one that was measured.
-        placed = Pose(pose.R, pose.t * (measured / length))
-        return rms(transfer_errors(placed, scene.points, used, pairs))
-
-    stated = Pose(rig.rotation, rig.translation)
-    error = error_of(stated)
-    check = Check("rms of corners carried by the rig", error, "px", LIMIT, len(pairs) * len(scene.points), "corners")
-    report.checks.append(check)
-    if error > LIMIT and (exchanged := error_of(stated, (second, first))) < min(LIMIT, 0.5 * error):
-        evidence = f"with the lenses exchanged, the rms of corners carried by the rig falls to {exchanged:.3g} px"
-        report.causes.append(Cause("left and right exchanged", f"{evidence} from {error:.3g} px", EXCHANGE))
-        return
-    _explain_pose(stated, error, error_of, "corners carried by the rig", report)
+    error = error_of(stated, (first, second), measured)
+    what = "corners carried by the rig"
+    report.checks.append(Check(f"rms of {what}", error, "px", LIMIT, len(pairs) * len(scene.points), "corners"))
+    if error > LIMIT and {"first", "second"} <= set(calibration.lenses):
+        swapped = calibration.lenses["second"], calibration.lenses["first"]
+        exchanged = error_of(stated, swapped, measured_with(swapped))
+        if exchanged < min(LIMIT, 0.5 * error):
+            evidence = f"with the lenses exchanged, the rms of {what} falls from {error:.3g} px to {exchanged:.3g} px"
+            report.causes.append(Cause("left and right exchanged", evidence, EXCHANGE))
+            return
+    _explain_pose(stated, error, lambda pose: error_of(pose, (first, second), measured), what, report)
 
 
 def _explain_pose(stated: Pose, error: float, error_of: Callable[[Pose], float], what: str, report: _Report) -> None:

@@ -1,4 +1,4 @@
-"""The command line: demo, reconstruct, convert, render. Heavy imports wait until a command runs."""
+"""The command line: demo, info, reconstruct, convert, render. Heavy imports wait until a command runs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from contextlib import ExitStack
 
-__all__ = ["convert", "demo", "main", "reconstruct", "render"]
+__all__ = ["convert", "demo", "info", "main", "reconstruct", "render"]
 
 KINDS = {"int": "a whole number", "float": "a finite number"}
 LONGEST_MESSAGE = 300
@@ -38,6 +38,45 @@ def demo(out: str = "lsmgeo-demo") -> None:
     print(f"pixels within 1 %:             {100 * float((errors < 0.01).double().mean()):.1f} %")
     print(f"time of the operators:         {result.seconds:.1f} s")
     print(f"picture:                       {path.resolve()}")
+
+
+def info(path: str, out: str = "lsmgeo-info") -> int:
+    """Say what a path holds and whether its cameras and pictures belong together; name the likely mistake where not.
+
+    Args:
+        path: scene, calibration or voxels: a folder, or the file that is meant where a folder holds several.
+        out: folder for the pictures; created where it does not exist.
+
+    Returns:
+        The exit status: 0 all is well, 1 it is not, 3 nothing could be measured (2 is for what cannot be read).
+    """
+    import time
+    from pathlib import Path
+
+    from lsmgeo import data
+    from lsmgeo.data.detect import detect
+    from lsmgeo.diagnosis import examine
+    from lsmgeo.diagnosis.photographs import examine_photographs
+    from lsmgeo.diagnosis.pictures import draw_examination
+    from lsmgeo.diagnosis.report import report
+
+    start = time.perf_counter()
+    source = Path(path)
+    content = detect(source).read(source)
+    drawn: dict[str, tuple[str, bytes]] = {}
+    if isinstance(content, data.PosedImages):
+        examination = examine_photographs(content)
+        findings = examination.findings
+        verdict = findings.verdict if findings.cause is None else findings.cause.name
+        drawn = draw_examination(content, examination, f"{source.resolve().name}: {verdict}")
+    else:
+        findings = examine(content, source)
+    written = {what: data.write_atomic(Path(out) / name, content) for what, (name, content) in drawn.items()}
+    print(report(findings))
+    print(f"{'time:':<18}{time.perf_counter() - start:.1f} s")
+    for what, file in written.items():
+        print(f"{what + ':':<28}{file.resolve()}")
+    return {"good": 0, "bad": 1, "unknown": 3}[findings.verdict]
 
 
 def reconstruct(
@@ -272,14 +311,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: by default those of the process.
 
     Returns:
-        The exit status: 0, 2 after a wrong argument or a file that cannot be used, 130 after an interrupt.
+        The exit status: 0, 1 or 3 as `info` says, 2 after a wrong argument or a file that cannot be used, 130 after an
+        interrupt.
     """
     from argparse import ArgumentError
 
     from lsmgeo.errors import LsmGeoError
 
     try:
-        _run(arguments)
+        return _run(arguments)
     except ArgumentError as error:
         print(f"lsmgeo: error: {_reason(str(error))} (see lsmgeo --help)", file=sys.stderr)
         return 2
@@ -289,10 +329,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("lsmgeo: interrupted", file=sys.stderr)
         return 130
-    return 0
 
 
-def _run(arguments: Sequence[str] | None) -> None:
+def _run(arguments: Sequence[str] | None) -> int:
     from importlib.metadata import PackageNotFoundError, version
 
     from jsonargparse import auto_cli
@@ -301,8 +340,8 @@ def _run(arguments: Sequence[str] | None) -> None:
         release = version("lsmgeo")
     except PackageNotFoundError:
         from lsmgeo import __version__ as release
-    auto_cli(
-        {"demo": demo, "reconstruct": reconstruct, "convert": convert, "render": render},
+    status = auto_cli(
+        {"demo": demo, "info": info, "reconstruct": reconstruct, "convert": convert, "render": render},
         args=None if arguments is None else list(arguments),
         as_positional=True,
         prog="lsmgeo",
@@ -312,6 +351,7 @@ def _run(arguments: Sequence[str] | None) -> None:
         exit_on_error=False,
         allow_abbrev=False,
     )
+    return status if isinstance(status, int) else 0
 
 
 def _reason(message: str) -> str:

@@ -1,0 +1,86 @@
+"""Matched features under cameras: their distance from epipolar lines, and whether what they show lies in front."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lsmgeo.diagnosis.geometry import Geometry, fundamental, relative
+
+if TYPE_CHECKING:
+    from lsmgeo.diagnosis.matching import Matches
+
+__all__ = ["in_front", "pair_distances", "sampson_distances"]
+
+# Rays nearer to parallel than this many pixels meet nowhere certain.
+LEAST_PARALLAX = 5.0
+
+
+def sampson_distances(matches: Matches, geometry: Geometry) -> np.ndarray:
+    """Signed distances of matches from their epipolar lines, (M,) px.
+
+    Equation: Sampson's, x2^T F x1 / sqrt(|F x1|^2 + |F^T x2|^2) with the first two coordinates under the root (Hartley
+    and Zisserman, "Multiple View Geometry", section 11.4.3). Two cameras in one place have no epipolar lines: there it
+    is half the distance between one pixel and the other's image under the homography K2 A K1^-1, never negative.
+    """
+    A, b = relative(geometry, matches.first, matches.second)
+    F = fundamental(geometry, matches.first, matches.second)
+    return _distances(matches.pixels, F[matches.pair], _homographies(geometry, matches, A, b)[matches.pair])
+
+
+def pair_distances(pixels: np.ndarray, geometry: Geometry, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Median distance of one pair's matches (M, 2, 2) under each of Q pairs of cameras, (Q,) px."""
+    F = fundamental(geometry, first, second)
+    A, b = relative(geometry, first, second)
+    H = geometry.K[second] @ A @ np.linalg.inv(geometry.K[first])
+    H[(b != 0).any(1)] = np.nan
+    distances = _distances(pixels[None], F[:, None], H[:, None])
+    return np.asarray(np.median(np.abs(distances), axis=1))
+
+
+def _homographies(geometry: Geometry, matches: Matches, A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of pairs without baseline; NaN for others."""
+    H = geometry.K[matches.second] @ A @ np.linalg.inv(geometry.K[matches.first])
+    H[(b != 0).any(1)] = np.nan
+    return np.asarray(H)
+
+
+def _distances(pixels: np.ndarray, F: np.ndarray, H: np.ndarray) -> np.ndarray:
+    """For pixels (..., 2, 2), F and H that broadcast against (..., 3, 3)."""
+    ones = np.ones((*pixels.shape[:-2], 1))
+    a, b = (np.concatenate([pixels[..., index, :], ones], -1) for index in (0, 1))
+    line = (F @ a[..., None])[..., 0]
+    back = (F.swapaxes(-1, -2) @ b[..., None])[..., 0]
+    root = np.sqrt((line[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        distance = (b * line).sum(-1) / root
+        if np.isfinite(H).any():
+            moved = (H @ a[..., None])[..., 0]
+            moved = moved[..., :2] / moved[..., 2:]
+            apart = 0.5 * np.linalg.norm(moved - pixels[..., 1, :], axis=-1)
+            distance = np.where(np.isfinite(H[..., 0, 0]), apart, distance)
+    # Neither line nor homography says anything of such a match: no camera pair can be worse.
+    return np.nan_to_num(distance, nan=1e9, posinf=1e9, neginf=-1e9)
+
+
+def in_front(matches: Matches, geometry: Geometry) -> np.ndarray:
+    """Whether matches meet in front of both cameras, (M,): 1 or 0, NaN where their rays are too parallel to tell.
+
+    Equation: the depths z1, z2 that minimise |z1 A r1 + b - z2 r2| for the rays r = K^-1 x.
+    """
+    A, b = (value[matches.pair] for value in relative(geometry, matches.first, matches.second))
+    inverse = np.linalg.inv(geometry.K)
+    ones = np.ones((len(matches.pair), 1))
+    rays = []
+    for index, views in enumerate((matches.first, matches.second)):
+        homogeneous = np.concatenate([matches.pixels[:, index], ones], 1)
+        rays.append(np.einsum("mij,mj->mi", inverse[views[matches.pair]], homogeneous))
+    turned, ray = np.einsum("mij,mj->mi", A, rays[0]), rays[1]
+    aa, rr, ar = (turned**2).sum(1), (ray**2).sum(1), (turned * ray).sum(1)
+    ab, rb = (turned * b).sum(1), (ray * b).sum(1)
+    determinant = aa * rr - ar**2
+    focal = np.sqrt(np.abs(geometry.K[:, 0, 0] * geometry.K[:, 1, 1]))[matches.second[matches.pair]]
+    known = (determinant > (LEAST_PARALLAX / focal) ** 2 * aa * rr) & (b != 0).any(1)
+    front = (ar * rb - ab * rr > 0) & (aa * rb - ar * ab > 0)
+    return np.where(known, front, np.nan)

@@ -1,0 +1,341 @@
+"""The kinds of evidence about posed photographs: what is measured once, and what follows of it under given cameras."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from lsmgeo.diagnosis.epipolar import in_front, sampson_distances
+from lsmgeo.diagnosis.findings import Check
+from lsmgeo.diagnosis.limits import CENTRED, LIMITS, pixel_limit
+from lsmgeo.diagnosis.matching import Matches, grey_picture, match_features
+from lsmgeo.diagnosis.outlines import epipolar_tangency, outline
+from lsmgeo.diagnosis.silhouettes import load_silhouettes, occupied_centers, overlap, within_a_cell
+from lsmgeo.diagnosis.sparse import reprojection_errors
+from lsmgeo.diagnosis.surfaces import (
+    Surfaces,
+    load_surfaces,
+    relative_errors,
+    surface_points,
+    thinned,
+    warp_errors,
+)
+
+if TYPE_CHECKING:
+    from lsmgeo.data import PosedImages
+    from lsmgeo.diagnosis.geometry import Geometry, Hypothesis
+
+__all__ = [
+    "Centres",
+    "DepthMaps",
+    "Evidence",
+    "Features",
+    "Outlines",
+    "Points",
+    "Solids",
+    "StereoPair",
+    "gather_evidence",
+    "is_rectified",
+    "principal_offsets",
+]
+
+LEAST_WITH_PARALLAX = 30
+LEAST_OBSERVATIONS = 20
+# Matches of a pair, and pairs of outlines, that a hypothesis is tried on.
+MATCHES_TRIED = 100
+OUTLINE_PAIRS, OUTLINE_PAIRS_TRIED = 300, 60
+PIXELS_TRIED = 400
+
+
+class Evidence(Protocol):
+    """Something that can be measured again with other cameras.
+
+    Attributes:
+        slow: whether a measurement takes long enough to be spared for hypotheses that are otherwise likely.
+    """
+
+    slow: bool
+
+    def measure(self, hypothesis: Hypothesis) -> list[Check]:
+        """The checks under a hypothesis, always the same ones, on as much as it takes to compare hypotheses."""
+
+    def measure_all(self, hypothesis: Hypothesis) -> list[Check]:
+        """The checks on all that there is, to be reported."""
+
+
+class Features:
+    """Matched features: their distance from epipolar lines, and on which side of the cameras they meet."""
+
+    slow = False
+
+    def __init__(self, scene: PosedImages, views: np.ndarray, sizes: np.ndarray, cameras: Geometry) -> None:
+        self.matches = match_features(scene, views)
+        self.limit = pixel_limit(sizes)
+        self.tried = self.matches.thinned(MATCHES_TRIED)
+        # Whether sides are judged is decided once, so that hypotheses are compared on the same checks.
+        known = np.isfinite(in_front(self.matches, cameras)).sum()
+        self.judges_sides = bool(known >= LEAST_WITH_PARALLAX)
+
+    def __bool__(self) -> bool:
+        return len(self.matches.pair) > 0
+
+    def measure(self, hypothesis: Hypothesis) -> list[Check]:
+        """Median distance from epipolar lines, and the share in front of both cameras."""
+        return self._measured(hypothesis, self.tried)
+
+    def measure_all(self, hypothesis: Hypothesis) -> list[Check]:
+        """The same on every match."""
+        return self._measured(hypothesis, self.matches)
+
+    def _measured(self, hypothesis: Hypothesis, matches: Matches) -> list[Check]:
+        distances = np.abs(sampson_distances(matches, hypothesis.photographs))
+        name = "epipolar error of matched features"
+        checks = [Check(name, float(np.median(distances)), "px", self.limit, len(distances), "matches")]
+        if self.judges_sides:
+            front = in_front(matches, hypothesis.photographs)
+            front = front[np.isfinite(front)]
+            share = 100 * float(front.mean()) if len(front) else 0.0
+            name = "matched features in front of both cameras"
+            checks.append(Check(name, share, "%", LIMITS["in front"], len(front), "matches", at_least=True))
+        return checks
+
+    def pair_medians(self, hypothesis: Hypothesis) -> np.ndarray:
+        """Median distance of each pair of views, (P,) px."""
+        distances = np.abs(sampson_distances(self.matches, hypothesis.photographs))
+        bounds = np.searchsorted(self.matches.pair, np.arange(len(self.matches.first) + 1))
+        return np.array([np.median(distances[a:b]) for a, b in itertools.pairwise(bounds)])
+
+
+class Points:
+    """Sparse points and their observations."""
+
+    slow = False
+
+    def __init__(self, scene: PosedImages, sizes: np.ndarray) -> None:
+        assert scene.points is not None
+        self.points = scene.points
+        self.limit = pixel_limit(sizes)
+
+    def __bool__(self) -> bool:
+        return sum(len(observed.points) for observed in self.points.observations) >= LEAST_OBSERVATIONS
+
+    def measure(self, hypothesis: Hypothesis) -> list[Check]:
+        """Median reprojection error, and the share of observations with their point in front of the camera."""
+        errors, depths, _ = reprojection_errors(self.points, hypothesis.beside)
+        front = 100 * float(np.mean(depths > 0))
+        name = "sparse points in front of their cameras"
+        return [
+            Check(
+                "reprojection error of sparse points",
+                float(np.median(errors)),
+                "px",
+                self.limit,
+                len(errors),
+                "observations",
+            ),
+            Check(name, front, "%", LIMITS["in front"], len(errors), "observations", at_least=True),
+        ]
+
+    measure_all = measure
+
+
+class DepthMaps:
+    """Depth maps of several views."""
+
+    slow = True
+
+    def __init__(self, scene: PosedImages, views: np.ndarray) -> None:
+        self.surfaces = load_surfaces(scene, views)
+        self.tried = thinned(self.surfaces, PIXELS_TRIED)
+
+    def __bool__(self) -> bool:
+        return len(self.surfaces.views) >= 2
+
+    def measure(self, hypothesis: Hypothesis) -> list[Check]:
+        """Median relative difference of depth between views."""
+        return self._measured(hypothesis, self.tried)
+
+    def measure_all(self, hypothesis: Hypothesis) -> list[Check]:
+        """The same on every pixel that was kept."""
+        return self._measured(hypothesis, self.surfaces)
+
+    def _measured(self, hypothesis: Hypothesis, surfaces: Surfaces) -> list[Check]:
+        errors, _ = relative_errors(surfaces, hypothesis)
+        value = 100 * float(np.median(np.abs(errors))) if len(errors) else float("inf")
+        return [Check("depth of one view in another", value, "%", LIMITS["depth"], len(errors), "pixels")]
+
+
+class StereoPair:
+    """A rectified pair with depth: one picture fetched by depth is the other one."""
+
+    slow = False
+
+    def __init__(self, scene: PosedImages) -> None:
+        self.surfaces = load_surfaces(scene, np.arange(2))
+        self.pictures = tuple(grey_picture(scene, view, max(scene.size(view)))[0] for view in range(2))
+
+    def __bool__(self) -> bool:
+        return len(self.surfaces.views) > 0
+
+    def measure(self, hypothesis: Hypothesis) -> list[Check]:
+        """Median difference in grey levels, against that without a warp."""
+        moved, unmoved = warp_errors(self.surfaces, hypothesis, self.pictures)
+        if len(moved) == 0:
+            return [Check("picture warped by depth", float("inf"), "grey levels", 1.0, 0, "pixels")]
+        limit = LIMITS["warp"] * float(np.median(unmoved))
+        value = float(np.median(moved))
+        return [Check("picture warped by depth", value, "grey levels", max(limit, 1.0), len(moved), "pixels")]
+
+    measure_all = measure
+
+
+class Outlines:
+    """Outlines of cut-out photographs: planes through the baseline touch them in both views."""
+
+    slow = False
+
+    def __init__(self, scene: PosedImages, views: np.ndarray, sizes: np.ndarray) -> None:
+        found = {}
+        for view in views.tolist():
+            mask = scene.load_mask(view)
+            contour = None if mask is None else outline(mask.numpy())
+            if contour is not None:
+                found[view] = contour
+        self.outlines = found
+        pairs = list(itertools.combinations(sorted(found), 2))
+        chosen = np.linspace(0, len(pairs) - 1, min(len(pairs), OUTLINE_PAIRS)).astype(int)
+        self.pairs = [pairs[index] for index in chosen]
+        chosen = np.linspace(0, len(self.pairs) - 1, min(len(pairs), OUTLINE_PAIRS_TRIED)).astype(int)
+        self.tried = [self.pairs[index] for index in chosen]
+        self.limit = pixel_limit(sizes)
+
+    def __bool__(self) -> bool:
+        return len(self.pairs) > 0
+
+    def measure(self, hypothesis: Hypothesis) -> list[Check]:
+        """Median distance between tangents."""
+        return self._measured(hypothesis, self.tried)
+
+    def measure_all(self, hypothesis: Hypothesis) -> list[Check]:
+        """The same on all pairs."""
+        return self._measured(hypothesis, self.pairs)
+
+    def _measured(self, hypothesis: Hypothesis, pairs: list[tuple[int, int]]) -> list[Check]:
+        distances = self.distances(hypothesis.photographs, pairs)
+        known = distances[np.isfinite(distances)]
+        value = float(np.median(known)) if len(known) else float("inf")
+        return [Check("epipolar tangency of the outlines", value, "px", self.limit, len(known), "tangents")]
+
+    def distances(self, cameras: Geometry, pairs: list[tuple[int, int]]) -> np.ndarray:
+        """(P, 2) px for each pair of views, NaN where a pair tells nothing."""
+        return np.array([self.distance(cameras, first, second, first, second) for first, second in pairs])
+
+    def distance(self, cameras: Geometry, first: int, second: int, camera1: int, camera2: int) -> np.ndarray:
+        """(2,) px for two views' outlines seen by two cameras."""
+        E = np.zeros((2, 4, 4))
+        for index, camera in enumerate((camera1, camera2)):
+            E[index, :3, :3], E[index, :3, 3], E[index, 3, 3] = cameras.R[camera], cameras.t[camera], 1.0
+        given = (cameras.K[camera1], E[0], cameras.K[camera2], E[1])
+        return epipolar_tangency(self.outlines[first], self.outlines[second], given)
+
+
+class Solids:
+    """The solid that photographs show: it projects into the outlines, and depth lies on it."""
+
+    slow = True
+
+    def __init__(self, scene: PosedImages, views: np.ndarray) -> None:
+        assert scene.voxels is not None
+        self.voxels = scene.voxels
+        self.solid = occupied_centers(scene.voxels)
+        self.silhouettes = load_silhouettes(scene, views) if scene.cut_out else None
+        self.surfaces = load_surfaces(scene, views) if scene.depths is not None else None
+
+    def __bool__(self) -> bool:
+        measurable = self.silhouettes is not None or (self.surfaces is not None and bool(self.surfaces.views))
+        return len(self.solid.centers) > 0 and measurable
+
+    def measure(self, hypothesis: Hypothesis) -> list[Check]:
+        """Cells inside the outlines, overlap with them, and depth points near occupied cells."""
+        checks = []
+        if self.silhouettes is not None:
+            recalls, unions = overlap(self.silhouettes, self.solid, hypothesis.photographs)
+            cells, views = len(self.solid.centers) * len(recalls), len(unions)
+            name = "voxels inside the outlines"
+            value = 100 * float(recalls.mean())
+            checks.append(Check(name, value, "%", LIMITS["inside"], cells, "voxels", at_least=True))
+            name = "overlap of the voxels with the outlines"
+            value = 100 * float(unions.mean())
+            checks.append(Check(name, value, "%", LIMITS["overlap"], views, "views", at_least=True))
+        if self.surfaces is not None and self.surfaces.views:
+            points = np.concatenate([surface_points(self.surfaces, hypothesis, view) for view in self.surfaces.views])
+            value = 100 * within_a_cell(points, self.voxels)
+            name = "depth points within a cell of the voxels"
+            checks.append(Check(name, value, "%", LIMITS["near a cell"], len(points), "points", at_least=True))
+        return checks
+
+    measure_all = measure
+
+
+class Centres:
+    """Principal points: near the middle of the picture where nothing else tells whether K belongs to its size."""
+
+    slow = False
+
+    def __init__(self, sizes: np.ndarray) -> None:
+        self.sizes = sizes
+
+    def __bool__(self) -> bool:
+        return True
+
+    def measure(self, hypothesis: Hypothesis) -> list[Check]:
+        """Largest distance of a principal point from the middle."""
+        value = 100 * float(principal_offsets(hypothesis.photographs, self.sizes).max())
+        return [Check(CENTRED, value, "%", LIMITS["centred"], len(self.sizes), "photographs")]
+
+    measure_all = measure
+
+
+def principal_offsets(cameras: Geometry, sizes: np.ndarray) -> np.ndarray:
+    """Distance of the principal points from the middle, (V, 2), as a fraction of width and height."""
+    middle = (sizes[:, ::-1] - 1) / 2
+    return np.asarray(np.abs(cameras.K[:, :2, 2] - middle) / sizes[:, ::-1])
+
+
+def is_rectified(cameras: Geometry) -> bool:
+    """Whether these are two cameras side by side that look the same way."""
+    if len(cameras.K) != 2:
+        return False
+    across = cameras.t[1] - cameras.t[0]
+    return bool(
+        np.allclose(cameras.R[0], cameras.R[1], atol=1e-6)
+        and np.linalg.norm(across) > 0
+        and np.abs(across[1:]).max() <= 1e-6 * np.linalg.norm(across)
+    )
+
+
+def gather_evidence(scene: PosedImages, views: np.ndarray, sizes: np.ndarray, asis: Hypothesis) -> list[Evidence]:
+    """All that can be measured about a scene.
+
+    Raises:
+        DataError: a photograph, a mask or a depth map that is needed is missing or damaged.
+    """
+    candidates: list[Evidence] = []
+    if len(scene) >= 2:
+        candidates.append(Features(scene, views, sizes, asis.photographs))
+    if scene.points is not None:
+        candidates.append(Points(scene, sizes))
+    if scene.cut_out and len(scene) >= 2:
+        candidates.append(Outlines(scene, views, sizes))
+    if scene.depths is not None:
+        if is_rectified(asis.photographs):
+            candidates.append(StereoPair(scene))
+        else:
+            candidates.append(DepthMaps(scene, views))
+    if scene.voxels is not None:
+        candidates.append(Solids(scene, views))
+    found = [evidence for evidence in candidates if evidence]
+    # A rectified pair's rows stay its rows whatever K is.
+    return [*found, Centres(sizes)] if found and is_rectified(asis.photographs) else found

@@ -1,0 +1,95 @@
+"""Cameras as plain matrices, so that they may be changed into what no camera is, and what follows from two of them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+if TYPE_CHECKING:
+    from lsmgeo.data import PosedImages
+
+__all__ = ["Geometry", "Hypothesis", "as_they_are", "fundamental", "project", "relative"]
+
+# A baseline below this fraction of the cameras' distance from the origin is rounding.
+NO_BASELINE = 1e-9
+
+
+class Geometry(NamedTuple):
+    """V cameras ``x ~ K (R X + t)`` in integer pixels; R is any regular matrix, for mirrored cameras are tried too."""
+
+    K: np.ndarray  # (V, 3, 3)
+    R: np.ndarray  # (V, 3, 3)
+    t: np.ndarray  # (V, 3)
+
+    @property
+    def centers(self) -> np.ndarray:
+        """Where the cameras are, (V, 3)."""
+        return -np.linalg.solve(self.R, self.t[..., None])[..., 0]
+
+    def taken(self, order: np.ndarray) -> Geometry:
+        """The cameras in another order."""
+        return Geometry(self.K[order], self.R[order], self.t[order])
+
+    def shifted(self, x: float, y: float) -> Geometry:
+        """The principal points moved by so many pixels."""
+        return self._replace(K=self.K + np.array([[0, 0, x], [0, 0, y], [0, 0, 0]]))
+
+
+class Hypothesis(NamedTuple):
+    """What the geometry would be, were it not for some mistake.
+
+    Attributes:
+        photographs: the camera of each photograph, (V,).
+        beside: the camera of what came beside each photograph, depth and sparse points; the same one unless
+            photographs alone are out of order.
+        depth_scale: what depth is multiplied with.
+        along_ray: whether depth is the distance from the camera's centre.
+    """
+
+    photographs: Geometry
+    beside: Geometry
+    depth_scale: float = 1.0
+    along_ray: bool = False
+
+
+def as_they_are(scene: PosedImages) -> Hypothesis:
+    """The cameras that the scene has, float64."""
+    K, E = (np.array(torch.as_tensor(value).double()) for value in scene.cameras[:2])
+    geometry = Geometry(K, E[:, :3, :3].copy(), E[:, :3, 3].copy())
+    return Hypothesis(geometry, geometry)
+
+
+def relative(geometry: Geometry, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A (P, 3, 3) and b (P, 3) with ``X2 = A X1 + b`` from the first cameras' coordinates to the second ones'.
+
+    Where two cameras are in one place, b is exactly zero.
+    """
+    inverse = np.linalg.inv(geometry.R)
+    A = geometry.R[second] @ inverse[first]
+    b = geometry.t[second] - np.einsum("pij,pj->pi", A, geometry.t[first])
+    sizes = np.maximum(np.linalg.norm(geometry.t[first], axis=1), np.linalg.norm(geometry.t[second], axis=1))
+    b[np.linalg.norm(b, axis=1) <= NO_BASELINE * sizes] = 0.0
+    return A, b
+
+
+def fundamental(geometry: Geometry, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """F (P, 3, 3) with ``x2^T F x1 = 0``; zero where two cameras are in one place.
+
+    Equation: F = K2^-T [b]x A K1^-1 (Hartley and Zisserman, "Multiple View Geometry", equation 9.2).
+    """
+    A, b = relative(geometry, first, second)
+    cross = np.zeros_like(A)
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -b[:, 2], b[:, 1], -b[:, 0]
+    cross -= cross.transpose(0, 2, 1)
+    inverse = np.linalg.inv(geometry.K)
+    return np.asarray(inverse[second].transpose(0, 2, 1) @ cross @ A @ inverse[first])
+
+
+def project(geometry: Geometry, view: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, 2) and depth (N,) of world points (N, 3) in one view; pixels are NaN at depth zero."""
+    camera = points @ geometry.R[view].T + geometry.t[view]
+    image = camera @ geometry.K[view].T
+    depth = image[:, 2]
+    return image[:, :2] / np.where(depth == 0, np.nan, depth)[:, None], depth

@@ -1,0 +1,174 @@
+"""Whether principal points are half a pixel off, which is too little to fail a check and enough to spoil depth."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from lsmgeo.diagnosis.epipolar import sampson_distances
+from lsmgeo.diagnosis.evidence import Features, Outlines, Points
+from lsmgeo.diagnosis.sparse import reprojections
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from lsmgeo.diagnosis.evidence import Evidence
+    from lsmgeo.diagnosis.geometry import Geometry
+
+__all__ = ["Shift", "find_shifts", "is_certain", "is_half_a_pixel"]
+
+STEP = 0.25  # px, for derivatives
+ITERATIONS = 20
+# Real calibrations are off by so much, px, and more by chance: half a pixel has to be this much likelier than none.
+SYSTEMATIC, LEAST_GAIN = 0.12, 9.0
+# Shifts less certain than this, px, tell nothing of half a pixel along both axes.
+LARGEST_ERROR = 0.3
+# Errors of the views' own calibration are told from a common one by leaving views out: fewer tell nothing.
+LEAST_VIEWS = 4
+LEAST_OBSERVED, LEAST_RESIDUALS = 10, 30
+DIAGONAL = np.linspace(-1.0, 1.0, 9)
+FARTHEST_TANGENT = 1.0  # px
+
+
+class Shift(NamedTuple):
+    """By how much all principal points seem to be too large, in px.
+
+    Attributes:
+        told_by: what was looked at.
+        x: along x.
+        y: along y.
+        error_x: standard error of x.
+        error_y: standard error of y.
+    """
+
+    told_by: str
+    x: float
+    y: float
+    error_x: float
+    error_y: float
+
+
+def find_shifts(evidence: Sequence[Evidence], cameras: Geometry) -> list[Shift]:
+    """What each kind of evidence says of a common shift of the principal points."""
+    found = []
+    for item in evidence:
+        if isinstance(item, Points):
+            found.append(_shift_of_points(item, cameras))
+        elif isinstance(item, Features):
+            residuals = [sampson_distances(item.matches, cameras.shifted(*step)) for step in _STEPS]
+            views = np.stack([item.matches.first, item.matches.second], 1)
+            found.append(_fitted("matched features", np.stack(residuals), item.matches.pair, views))
+        elif isinstance(item, Outlines):
+            found.append(_shift_of_outlines(item, cameras))
+    return [shift for shift in found if shift is not None]
+
+
+def is_half_a_pixel(shift: Shift) -> bool:
+    """Whether half a pixel along both axes, to the same side, is much likelier than nothing.
+
+    Example:
+        >>> from lsmgeo.diagnosis.half_pixel import Shift, is_half_a_pixel
+        >>> is_half_a_pixel(Shift("matched features", 0.55, 0.48, 0.05, 0.05))
+        True
+        >>> is_half_a_pixel(Shift("matched features", 0.2, 0.1, 0.05, 0.05))
+        False
+    """
+    errors = np.array([shift.error_x, shift.error_y])
+    found = np.array([shift.x, shift.y])
+
+    def distance(expected: float) -> float:
+        return float(((found - expected) ** 2 / (errors**2 + SYSTEMATIC**2)).sum())
+
+    gain = distance(0.0) - min(distance(0.5), distance(-0.5))
+    return bool(gain >= LEAST_GAIN) and is_certain(shift)
+
+
+def is_certain(shift: Shift) -> bool:
+    """Whether a shift of half a pixel would have been seen."""
+    return max(shift.error_x, shift.error_y) <= LARGEST_ERROR
+
+
+_STEPS = ((0.0, 0.0), (STEP, 0.0), (-STEP, 0.0), (0.0, STEP), (0.0, -STEP))
+
+
+def _shift_of_points(points: Points, cameras: Geometry) -> Shift | None:
+    """Medians of what projects beside its observation, over views."""
+    medians = []
+    for view, observed in enumerate(points.points.observations):
+        if len(observed.points) >= LEAST_OBSERVED:
+            medians.append(np.median(reprojections(points.points, cameras, view, view)[0], axis=0))
+    if len(medians) < LEAST_VIEWS:
+        return None
+    mean = np.mean(medians, axis=0)
+    errors = np.std(medians, axis=0, ddof=1) / np.sqrt(len(medians)) + 1e-6
+    return Shift("sparse points", *(float(value) for value in (*mean, *errors)))
+
+
+def _shift_of_outlines(outlines: Outlines, cameras: Geometry) -> Shift | None:
+    """Where along the diagonal the tangents' squared distances are least, which have no sign to be followed."""
+    views = np.array(outlines.pairs)
+    if len(outlines.outlines) < LEAST_VIEWS:
+        return None
+    costs = []
+    for shift in DIAGONAL:
+        distances = np.minimum(outlines.distances(cameras.shifted(-shift, -shift), outlines.pairs), FARTHEST_TANGENT)
+        costs.append(np.nansum(distances**2, axis=1))
+    table = np.array(costs)  # (S, P)
+
+    def lowest(chosen: np.ndarray) -> float:
+        sums = table[:, chosen].sum(1)
+        middle = int(np.clip(sums.argmin(), 1, len(sums) - 2))
+        before, here, after = sums[middle - 1 : middle + 2]
+        bend = before - 2 * here + after
+        aside = 0.5 * (before - after) / bend if bend > 0 else 0.0
+        return float(DIAGONAL[middle] + np.clip(aside, -1, 1) * (DIAGONAL[1] - DIAGONAL[0]))
+
+    best = lowest(np.ones(len(views), bool))
+    without = np.array([lowest((views != view).all(1)) for view in sorted(outlines.outlines)])
+    error = _left_out(without[:, None])[0]
+    return Shift("outlines", best, best, float(error), float(error))
+
+
+def _left_out(without: np.ndarray) -> np.ndarray:
+    """Standard errors from estimates (V, K) without one view each: pairs of one view share its errors."""
+    spread = without - without.mean(0)
+    return np.asarray(np.sqrt((len(without) - 1) / len(without) * (spread**2).sum(0)) + 1e-6)
+
+
+def _fitted(told_by: str, residuals: np.ndarray, pair: np.ndarray, views: np.ndarray) -> Shift | None:
+    """The shift that makes signed residuals least, with robust weights; its errors by leaving out views.
+
+    Args:
+        told_by: what the residuals are of.
+        residuals: (5, M) at no shift and at the steps along +x, -x, +y, -y.
+        pair: (M,) which pair of views each one is of.
+        views: (P, 2) the views of each pair.
+    """
+    slopes = np.stack([residuals[1] - residuals[2], residuals[3] - residuals[4]], 1) / (2 * STEP)
+    sensible = np.abs(slopes).max(1) < 10
+    r, J, pair = residuals[0][sensible], slopes[sensible], pair[sensible]
+    if len(r) < LEAST_RESIDUALS or len(np.unique(views[np.unique(pair)])) < LEAST_VIEWS:
+        return None
+    shift = np.zeros(2)
+    for _ in range(ITERATIONS):
+        left = r + J @ shift
+        scale = 1.4826 * np.median(np.abs(left)) + 1e-12
+        weight = np.clip(1 - (left / (4.7 * scale)) ** 2, 0, None) ** 2  # Tukey's
+        normal = np.einsum("m,mi,mj->mij", weight, J, J)
+        right = -(weight * r)[:, None] * J
+        if np.linalg.cond(normal.sum(0)) > 1e8:
+            return None
+        shift = np.linalg.solve(normal.sum(0), right.sum(0))
+    count = len(views)
+    normals = np.stack([np.bincount(pair, normal[:, i, j], count) for i in (0, 1) for j in (0, 1)], 1).reshape(-1, 2, 2)
+    rights = np.stack([np.bincount(pair, right[:, i], count) for i in (0, 1)], 1)
+    without = []
+    for view in np.unique(views[np.unique(pair)]):
+        kept = (views != view).all(1)
+        if np.linalg.cond(normals[kept].sum(0)) > 1e8:
+            return None
+        without.append(np.linalg.solve(normals[kept].sum(0), rights[kept].sum(0)))
+    errors = _left_out(np.array(without))
+    # Residuals vanish at cameras shifted by ``shift``: as they are, they are too large by its opposite.
+    return Shift(told_by, *(float(value) for value in (*-shift, *errors)))

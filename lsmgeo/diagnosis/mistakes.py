@@ -1,0 +1,221 @@
+"""Mistakes that people make with cameras, each with the correction that would undo it."""
+
+from __future__ import annotations
+
+import itertools
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from lsmgeo.diagnosis.geometry import Geometry, Hypothesis
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+__all__ = ["Candidate", "camera_mistakes", "depth_mistakes", "focal_mistakes", "resolution_mistakes", "scaled"]
+
+DIRECTIONS = (("right", "left"), ("down", "up"), ("forward", "back"))
+OPENGL = np.diag([1.0, -1.0, -1.0])
+FLIP = np.diag([1.0, -1.0, 1.0])
+# Scales between which K of another resolution is sought; the search refines what is best.
+SCALES = np.geomspace(1 / 8, 8, 61)
+UNITS = (1000.0, 100.0, 10.0, 5.0, 25.4, 2.54, 4.0, 2.0, 256.0)
+
+
+class Candidate(NamedTuple):
+    """A mistake that may have been made.
+
+    Attributes:
+        name: the mistake's short name.
+        corrected: how the correction is told, such as "inverted".
+        remedy: what to do, one sentence.
+        hypothesis: the geometry with the mistake undone.
+    """
+
+    name: str
+    corrected: str
+    remedy: str
+    hypothesis: Hypothesis
+
+
+def camera_mistakes(asis: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
+    """Mistakes that concern every camera alike, common ones first.
+
+    Args:
+        asis: the cameras as they are.
+        sizes: (V, 2) height and width of the photographs.
+    """
+    inverse = (
+        "The poses are camera-to-world where world-to-camera is meant: invert the 4 x 4 matrices "
+        "(R^T and -R^T t), or read them as camera-to-world."
+    )
+    opengl = (
+        "The cameras' axes are OpenGL's (y up, z backwards): negate the second and third row of world-to-camera, "
+        "or use lsmgeo.cameras.from_opengl."
+    )
+    flipped = "y points the other way: {}."
+    table: list[tuple[str, str, str, Callable[[Geometry], Geometry]]] = [
+        ("poses inverted", "inverted", inverse, _inverted),
+        ("OpenGL axes", "with y and z negated", opengl, lambda cameras: _turned(cameras, OPENGL)),
+        (
+            "y flipped",
+            "with the cameras' and the world's y negated",
+            flipped.format("negate it in the cameras and in the world, which is left-handed here"),
+            lambda cameras: _mirrored(_turned(cameras, FLIP), FLIP),
+        ),
+        (
+            "y flipped",
+            "with the photographs upside down",
+            flipped.format("the rows of the photographs are stored from the bottom up; flip them"),
+            lambda cameras: _flipped(cameras, sizes, 1),
+        ),
+        (
+            "y flipped",
+            "with the cameras' y negated",
+            flipped.format("negate the second row of world-to-camera"),
+            lambda cameras: _turned(cameras, FLIP),
+        ),
+        (
+            "poses inverted and OpenGL axes",
+            "inverted, then with y and z negated",
+            f"{inverse} {opengl}",
+            lambda cameras: _turned(_inverted(cameras), OPENGL),
+        ),
+        (
+            "poses inverted and OpenGL axes",
+            "with y and z negated, then inverted",
+            f"{opengl} {inverse}",
+            lambda cameras: _inverted(_turned(cameras, OPENGL)),
+        ),
+        (
+            "rotation transposed",
+            "with every rotation transposed",
+            "The rotations are camera-to-world and the translations are not: transpose the rotations.",
+            lambda cameras: cameras._replace(R=np.linalg.inv(cameras.R)),
+        ),
+        (
+            "centre taken as translation",
+            "with t = -R C",
+            "What is taken for the translation is the camera's centre C: t is -R C.",
+            lambda cameras: cameras._replace(t=-np.einsum("vij,vj->vi", cameras.R, cameras.t)),
+        ),
+        (
+            "translation negated",
+            "with t negated",
+            "The translations have the wrong sign: negate them.",
+            lambda cameras: cameras._replace(t=-cameras.t),
+        ),
+        (
+            "x flipped",
+            "with the photographs mirrored",
+            "The photographs are mirrored left to right, or the cameras' x points left: mirror them back.",
+            lambda cameras: _flipped(cameras, sizes, 0),
+        ),
+    ]
+    found = [Candidate(*row[:3], _both(asis, row[3])) for row in table]
+    for turn, words in _other_axes():
+        remedy = f"The cameras' x, y, z axes point {words}: bring them to right, down, forward."
+        turned, both = (_both(asis, partial(change, turn=turn)) for change in (_turned, _inverted_and_turned))
+        found.append(Candidate("other camera axes", f"with axes {words}", remedy, turned))
+        found.append(Candidate("other camera axes", f"inverted, with axes {words}", f"{inverse} {remedy}", both))
+    return found
+
+
+def resolution_mistakes(asis: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
+    """K of photographs of another size: by powers of two, and by what would centre the principal points."""
+    middles = (np.median(sizes[:, ::-1], axis=0) / 2) / (np.median(asis.photographs.K[:, :2, 2], axis=0) + 0.5)
+    hints = [middles, np.full(2, middles.mean())] if (middles > 0.05).all() and (middles < 20).all() else []
+    factors = [*(np.full(2, 2.0**power) for power in (-1, 1, -2, 2, -3, 3)), *hints]
+    return [scaled(asis, factor) for factor in factors if np.abs(np.log(factor)).max() > 0.02]
+
+
+def scaled(asis: Hypothesis, factor: np.ndarray) -> Candidate:
+    """All of K multiplied, with half-integer pixel centres, by (2,) factors along x and y."""
+    told = (
+        f"{factor[0]:.4g}"
+        if np.isclose(factor[0], factor[1], rtol=1e-3)
+        else f"{factor[0]:.4g} along x, {factor[1]:.4g} along y"
+    )
+    scale = np.diag([*factor, 1.0])
+    scale[:2, 2] = 0.5 * factor - 0.5
+
+    def changed(cameras: Geometry) -> Geometry:
+        return cameras._replace(K=scale @ cameras.K)
+
+    remedy = (
+        f"K belongs to photographs of another size: multiply fx and cx, fy and cy by {told} "
+        "(lsmgeo.cameras.resize keeps the half pixel right), or use the photographs of K's size."
+    )
+    return Candidate("K of another resolution", f"with K times {told}", remedy, _both(asis, changed))
+
+
+def focal_mistakes(asis: Hypothesis, scales: Iterable[float]) -> list[Candidate]:
+    """Focal lengths that are wrong by each of the scales, while the principal points are right."""
+    found = []
+    for scale in scales:
+        factor = np.array([[scale, scale, 1.0], [scale, scale, 1.0], [1.0, 1.0, 1.0]])
+        remedy = f"The focal lengths are off by a factor of {scale:.4g}: check angles, units and which side is meant."
+        changed = _both(asis, partial(_multiplied, factor=factor))
+        found.append(Candidate("focal length off", f"with focal lengths times {scale:.4g}", remedy, changed))
+    return found
+
+
+def depth_mistakes(asis: Hypothesis, scales: Iterable[float] = ()) -> list[Candidate]:
+    """Depth along the ray, and depth in other units: common ones and ``scales``."""
+    along = "Depth is the distance along the ray: divide it by the length of K^-1 (x, y, 1), which makes it camera z."
+    found = [Candidate("depth along the ray", "along the ray", along, asis._replace(along_ray=True))]
+    for scale in [*UNITS, *(1 / unit for unit in UNITS), *scales]:
+        remedy = f"Depth and translations are in different units: multiply depth by {scale:.4g}."
+        found.append(
+            Candidate("depth in other units", f"with depth times {scale:.4g}", remedy, asis._replace(depth_scale=scale))
+        )
+    return found
+
+
+def _both(asis: Hypothesis, change: Callable[[Geometry], Geometry]) -> Hypothesis:
+    photographs = change(asis.photographs)
+    beside = photographs if asis.beside is asis.photographs else change(asis.beside)
+    return asis._replace(photographs=photographs, beside=beside)
+
+
+def _inverted(cameras: Geometry) -> Geometry:
+    return cameras._replace(R=np.linalg.inv(cameras.R), t=cameras.centers)
+
+
+def _multiplied(cameras: Geometry, factor: np.ndarray) -> Geometry:
+    return cameras._replace(K=cameras.K * factor)
+
+
+def _turned(cameras: Geometry, turn: np.ndarray) -> Geometry:
+    return cameras._replace(R=turn @ cameras.R, t=cameras.t @ turn.T)
+
+
+def _inverted_and_turned(cameras: Geometry, turn: np.ndarray) -> Geometry:
+    return _turned(_inverted(cameras), turn)
+
+
+def _mirrored(cameras: Geometry, mirror: np.ndarray) -> Geometry:
+    return cameras._replace(R=cameras.R @ mirror)
+
+
+def _flipped(cameras: Geometry, sizes: np.ndarray, axis: int) -> Geometry:
+    """Cameras of photographs that are mirrored along x (0) or y (1)."""
+    K = cameras.K.copy()
+    K[:, axis] *= -1
+    K[:, axis, 2] += sizes[:, 1 - axis] - 1
+    return cameras._replace(K=K)
+
+
+def _other_axes() -> list[tuple[np.ndarray, str]]:
+    """Turns between right-handed systems of camera axes, except those that have names of their own."""
+    found = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            # Column i is where the file's axis i points, in ours.
+            turn = np.zeros((3, 3))
+            turn[list(order), range(3)] = signs
+            if np.linalg.det(turn) > 0 and not (np.array_equal(turn, np.eye(3)) or np.array_equal(turn, OPENGL)):
+                words = ", ".join(DIRECTIONS[axis][int(sign < 0)] for axis, sign in zip(order, signs, strict=True))
+                found.append((turn, words))
+    return found

@@ -1,0 +1,177 @@
+"""Posed photographs examined: measured as they are, then with likely mistakes undone."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from lsmgeo.diagnosis.evidence import Evidence, Features, Points, gather_evidence
+from lsmgeo.diagnosis.explain import explain
+from lsmgeo.diagnosis.facts import describe_scene, implausibilities
+from lsmgeo.diagnosis.findings import Cause, Check, Findings
+from lsmgeo.diagnosis.geometry import Hypothesis, as_they_are
+from lsmgeo.diagnosis.half_pixel import Shift, find_shifts, is_certain, is_half_a_pixel
+from lsmgeo.diagnosis.limits import CENTRED, LIMITS, badness
+from lsmgeo.diagnosis.matching import choose_views
+from lsmgeo.diagnosis.report import tell
+from lsmgeo.diagnosis.sparse import reprojection_errors
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from lsmgeo.data import PosedImages
+    from lsmgeo.diagnosis.explain import Explanation
+
+__all__ = ["Examination", "examine_photographs"]
+
+# Of the views, at most this fraction may be off for the others to be believed.
+MOST_OFF = 1 / 3
+# A check this near to its limit is looked into though it passes.
+SUSPICIOUS = 0.5
+LISTED = 5
+LEAST_PAIRS, LEAST_OBSERVED = 2, 10
+
+
+class Examination(NamedTuple):
+    """What was found, and what is needed to draw it."""
+
+    findings: Findings
+    evidence: tuple[Evidence, ...]
+    hypothesis: Hypothesis
+    views: np.ndarray
+
+
+def examine_photographs(scene: PosedImages) -> Examination:
+    """Measure whether cameras, photographs and what came with them belong together, and find the mistake if not.
+
+    Of more than 40 photographs, runs of successive ones are looked at, always the same.
+
+    Args:
+        scene: the photographs; they are read one at a time.
+
+    Returns:
+        The findings, and the evidence for pictures.
+
+    Raises:
+        DataError: a photograph, mask or depth map is missing or damaged.
+    """
+    sizes = np.array([scene.size(view) for view in range(len(scene))])
+    views = choose_views(len(scene))
+    asis = as_they_are(scene)
+    evidence = gather_evidence(scene, views, sizes, asis)
+    checks = [check for item in evidence for check in item.measure_all(asis)]
+    cause, remarks = None, implausibilities(asis.photographs, sizes)
+    if not all(check.passed for check in checks) or any(
+        badness(check) > SUSPICIOUS for check in checks if check.name != CENTRED
+    ):
+        explanation, tried = explain(asis, evidence, scene.names, sizes, views)
+        cause = None if explanation is None else _told(explanation)
+        if cause is None and not all(check.passed for check in checks):
+            remarks.append(f"no single mistake explains this; tried were {', '.join(tried)}, half a pixel")
+    if cause is None:
+        checks, cause = _with_views(scene, checks, evidence, asis)
+    if cause is None:
+        shifts = find_shifts(evidence, asis.photographs)
+        cause = _half_a_pixel(shifts)
+        if cause is None and checks and not any(is_certain(shift) for shift in shifts):
+            remarks.append("half a pixel more or less could not be seen in this data")
+    facts = describe_scene(scene, views, evidence, asis, sizes)
+    findings = Findings(tuple(facts), tuple(checks), cause, tuple(remarks))
+    return Examination(findings, tuple(evidence), asis, views)
+
+
+def _told(explanation: Explanation) -> Cause:
+    """In words: the checks that the correction improves most."""
+    candidate, before, after, rivals = explanation
+    gains = [badness(old) / badness(new) for old, new in zip(before, after, strict=True)]
+    parts = []
+    for index in np.argsort(gains)[::-1][:2].tolist():
+        if gains[index] > 1.5:
+            old, new = before[index], after[index]
+            parts.append(f"{old.name}: {tell(new.value)} instead of {tell(old.value)} {old.unit}".rstrip())
+    evidence = f"{candidate.corrected}, {'; '.join(parts)}"
+    if rivals:
+        evidence += f" (this data cannot tell it from: {', '.join(rivals)})"
+    return Cause(candidate.name, evidence, candidate.remedy)
+
+
+def _half_a_pixel(shifts: Sequence[Shift]) -> Cause | None:
+    told = [shift for shift in shifts if is_half_a_pixel(shift)]
+    # Evidence that is as certain and says otherwise speaks against it.
+    against = [shift for shift in shifts if is_certain(shift) and not is_half_a_pixel(shift)]
+    if len(told) <= len(against):
+        return None
+    best = min(told, key=lambda shift: max(shift.error_x, shift.error_y))
+    large = best.x > 0
+    evidence = (
+        f"the {best.told_by} put the principal points {abs(best.x):.2f} +- {best.error_x:.2f} px (x) and "
+        f"{abs(best.y):.2f} +- {best.error_y:.2f} px (y) too {'far' if large else 'near'}"
+    )
+    remedy = (
+        "cx and cy count pixels from a corner where from the centre of the first pixel is meant: subtract 0.5."
+        if large
+        else "0.5 was subtracted from cx and cy once too often: add 0.5."
+    )
+    return Cause("half a pixel", evidence, remedy)
+
+
+def _with_views(
+    scene: PosedImages, checks: list[Check], evidence: Sequence[Evidence], asis: Hypothesis
+) -> tuple[list[Check], Cause | None]:
+    """Add a check of single views, where all others agree; a view that does not is a cause of its own."""
+    off: set[int] = set()
+    judged: set[int] = set()
+    for item in evidence:
+        if isinstance(item, Features):
+            found, known = _off_by_features(item, asis)
+        elif isinstance(item, Points):
+            found, known = _off_by_points(item, asis)
+        else:
+            continue
+        off |= found
+        judged |= known
+    if not judged or len(off) > MOST_OFF * len(judged):
+        return checks, None
+    value = 100 * (1 - len(off) / len(judged))
+    name = "photographs that agree with the others"
+    checks = [*checks, Check(name, value, "%", 100.0, len(judged), "photographs", at_least=True)]
+    if not off:
+        return checks, None
+    names = ", ".join(scene.names[view] for view in sorted(off)[:LISTED])
+    more = f" and {len(off) - LISTED} more" if len(off) > LISTED else ""
+    evidence_text = f"{names}{more} disagree with all others, which agree with each other"
+    return checks, Cause("some views are off", evidence_text, "Leave these photographs out, or find their poses again.")
+
+
+def _off_by_features(features: Features, asis: Hypothesis) -> tuple[set[int], set[int]]:
+    """Views all of whose pairs are bad, taken away one by one until the others agree."""
+    first, second = features.matches.first, features.matches.second
+    medians = features.pair_medians(asis)
+    bad = medians > max(LIMITS["view"] * features.limit, LIMITS["view"] * float(np.median(medians)))
+    left = np.ones(len(first), bool)
+    off: set[int] = set()
+    while (bad & left).any():
+        views = np.unique(np.concatenate([first[left], second[left]]))
+        pairs = {int(view): left & ((first == view) | (second == view)) for view in views}
+        enough = {view: of for view, of in pairs.items() if of.sum() >= LEAST_PAIRS}
+        shares = {view: (float(bad[of].mean()), int(bad[of].sum())) for view, of in enough.items()}
+        if not shares:
+            break
+        view = max(shares, key=lambda view: shares[view])
+        if shares[view][0] < 1:
+            break
+        off.add(view)
+        left &= ~pairs[view]
+    counts = np.bincount(np.concatenate([first, second]))
+    return off, {int(view) for view in np.flatnonzero(counts >= LEAST_PAIRS)}
+
+
+def _off_by_points(points: Points, asis: Hypothesis) -> tuple[set[int], set[int]]:
+    errors, _, views = reprojection_errors(points.points, asis.beside)
+    known = [view for view in np.unique(views) if (views == view).sum() >= LEAST_OBSERVED]
+    medians = np.array([np.median(errors[views == view]) for view in known])
+    if not known:
+        return set(), set()
+    limit = LIMITS["view"] * max(points.limit, float(np.median(medians)))
+    return {int(view) for view, median in zip(known, medians, strict=True) if median > limit}, {int(v) for v in known}

@@ -1,0 +1,339 @@
+"""Pictures of an examination, for people: where the cameras are, and where measurements agree or do not."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lsmgeo.diagnosis.epipolar import sampson_distances
+from lsmgeo.diagnosis.evidence import DepthMaps, Features, Solids, StereoPair
+from lsmgeo.diagnosis.geometry import fundamental
+from lsmgeo.diagnosis.silhouettes import draw_solid, occupied_centers
+from lsmgeo.diagnosis.surfaces import seen_errors, surface_points, warped
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from lsmgeo.data import PosedImages
+    from lsmgeo.diagnosis.geometry import Geometry
+    from lsmgeo.diagnosis.photographs import Examination
+
+__all__ = ["draw_examination"]
+
+DPI = 90
+MOST_POINTS, MOST_MATCHES = 4000, 12
+# Up to so many cameras have their numbers written beside them.
+MOST_NUMBERS = 60
+LONGEST_SIDE = 900
+# Frusta are this long, as a part of the way to the nearest other camera and of the whole.
+FRUSTUM, FRUSTUM_OF_ALL = 0.6, 0.12
+
+
+def draw_examination(scene: PosedImages, examination: Examination, title: str) -> dict[str, tuple[str, bytes]]:
+    """Draw what was examined.
+
+    Args:
+        scene: the photographs.
+        examination: what was found about them.
+        title: what to write above.
+
+    Returns:
+        For each picture what it shows, its file's name, and a PNG.
+
+    Raises:
+        DataError: a photograph is missing or damaged.
+    """
+    pictures = {"cameras": ("cameras.png", _cameras(scene, examination, title))}
+    for item in examination.evidence:
+        if isinstance(item, Features):
+            pictures["matches and epipolar lines"] = ("matches.png", _matches(scene, examination, item, title))
+        elif isinstance(item, DepthMaps):
+            pictures["depth of a view in another"] = ("depth.png", _depth(scene, examination, item, title))
+        elif isinstance(item, StereoPair):
+            pictures["pair warped by depth"] = ("warp.png", _warp(examination, item, title))
+        elif isinstance(item, Solids) and item.silhouettes is not None:
+            pictures["voxels in the outlines"] = ("outlines.png", _outlines(scene, examination, item, title))
+    return pictures
+
+
+def _figure(width: float, height: float, title: str) -> Figure:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title)
+    return figure
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    return buffer.getvalue()
+
+
+def _colours(count: int) -> np.ndarray:
+    from matplotlib import colormaps
+
+    return np.asarray(colormaps["turbo"](np.linspace(0.05, 0.95, count))[:, :3])
+
+
+def _cameras(scene: PosedImages, examination: Examination, title: str) -> bytes:
+    """Cameras from above and from aside; "above" is the mean of the cameras' own up."""
+    cameras = examination.hypothesis.photographs
+    content, colours = _content(scene, examination)
+    # Axes of the drawing: across, up, and towards the viewer who looks from above.
+    up = -cameras.R[:, 1].mean(0)
+    if np.linalg.norm(up) < 0.2:
+        up = -cameras.R[0, 1]
+    up = up / np.linalg.norm(up)
+    front = np.eye(3)[np.argmin(np.abs(up))]
+    across = np.cross(up, front)
+    across /= np.linalg.norm(across)
+    system = np.stack([across, np.cross(up, across), up])
+    sizes = np.array([scene.size(view) for view in range(len(scene))])
+    figure = _figure(14, 7.4, title)
+    views = (("from above", 90.0), ("from aside", 25.0))
+    for axes, (words, elevation) in zip(figure.subplots(1, 2), views, strict=True):
+        axes.set_title(f"{len(cameras.K)} cameras {words}")
+        angle = np.radians(elevation)
+        # Rows: right, up on the paper, and out of it.
+        tilt = np.array([[1, 0, 0], [0, np.sin(angle), np.cos(angle)], [0, -np.cos(angle), np.sin(angle)]])
+        _draw_cameras(axes, cameras, content, colours, tilt @ system, sizes)
+    return _png(figure)
+
+
+def _content(scene: PosedImages, examination: Examination) -> tuple[np.ndarray, np.ndarray | str]:
+    """Points of what is seen, (N, 3), and their colours."""
+    points, colours = np.zeros((0, 3)), "0.45"
+    if scene.points is not None and len(scene.points.positions):
+        chosen = np.linspace(0, len(scene.points.positions) - 1, MOST_POINTS).astype(int)
+        chosen = np.unique(chosen)
+        return scene.points.positions[chosen], scene.points.colours[chosen] / 255.0
+    if scene.voxels is not None:
+        centers = occupied_centers(scene.voxels).centers
+        return centers[:: max(1, len(centers) // MOST_POINTS)], colours
+    for item in examination.evidence:
+        if isinstance(item, DepthMaps | StereoPair):
+            each = [surface_points(item.surfaces, examination.hypothesis, view) for view in item.surfaces.views]
+            points = np.concatenate(each)
+    return points[:: max(1, len(points) // MOST_POINTS)], colours
+
+
+def _draw_cameras(
+    axes: Axes,
+    cameras: Geometry,
+    content: np.ndarray,
+    colours: np.ndarray | str,
+    system: np.ndarray,
+    sizes: np.ndarray,
+) -> None:
+    from matplotlib.collections import LineCollection
+
+    centers = cameras.centers
+    middle = np.median(np.concatenate([centers, content]), axis=0)
+    length = _frustum_length(centers, content)
+    seen = (content - middle) @ system.T
+    if len(content):
+        order = np.argsort(seen[:, 2])
+        shown = colours if isinstance(colours, str) else colours[order]
+        axes.scatter(seen[order, 0], seen[order, 1], c=shown, s=3, linewidths=0)
+    placed = (centers - middle) @ system.T
+    places = [placed]
+    for view, colour in enumerate(_colours(len(centers))):
+        height, width = sizes[view]
+        corners = np.array(
+            [[-0.5, -0.5, 1], [width - 0.5, -0.5, 1], [width - 0.5, height - 0.5, 1], [-0.5, height - 0.5, 1]]
+        )
+        rays = np.concatenate([corners, [[(width - 1) / 2, (height - 1) / 2, 1]]]) @ np.linalg.inv(cameras.K[view]).T
+        rays = rays / np.abs(rays[:4, :2]).max() * 0.5 if np.abs(rays[:4, :2]).max() > 0.5 else rays
+        ends = (rays * length) @ np.linalg.inv(cameras.R[view]).T @ system.T + placed[view]
+        places.append(ends)
+        corner = ends[:4, :2]
+        lines = [np.stack([placed[view, :2], end]) for end in corner]
+        lines += [np.concatenate([corner, corner[:1]])]
+        axes.add_collection(LineCollection(lines, colors=[colour], linewidths=0.9, alpha=0.8))
+        # The optical axis, dashed, and the picture's upper side, thick.
+        along = np.stack([placed[view, :2], placed[view, :2] + 1.8 * (ends[4, :2] - placed[view, :2])])
+        axes.add_collection(LineCollection([along], colors=[colour], linewidths=0.7, linestyles="dotted"))
+        axes.add_collection(LineCollection([corner[:2]], colors=[colour], linewidths=2.4))
+    _number(axes, placed, length)
+    limits = [np.concatenate(places)[:, :2]]
+    if len(content):
+        limits.append(np.percentile(seen[:, :2], (2, 98), axis=0))
+    everything = np.concatenate(limits)
+    low, high = everything.min(0), everything.max(0)
+    margin = 0.06 * (high - low).max() + 1e-12
+    axes.set_xlim(low[0] - margin, high[0] + margin)
+    axes.set_ylim(low[1] - margin, high[1] + margin)
+    axes.set_aspect("equal")
+    axes.tick_params(labelsize=7)
+    axes.set_xlabel("world units; thick: the upper side of the picture; dotted: the optical axis", fontsize=8)
+
+
+def _number(axes: Axes, placed: np.ndarray, length: float) -> None:
+    """Numbers outside the ring that cameras often make; of very many, every few."""
+    step = int(np.ceil(len(placed) / MOST_NUMBERS))
+    middle = placed[:, :2].mean(0)
+    for view in range(0, len(placed), step):
+        away = placed[view, :2] - middle
+        away = away / max(float(np.linalg.norm(away)), 1e-12)
+        x, y = placed[view, :2] + 0.35 * length * away
+        axes.text(x, y, str(view), fontsize=8, ha="center", va="center")
+
+
+def _frustum_length(centers: np.ndarray, content: np.ndarray) -> float:
+    """So long that neighbours hardly overlap and all are seen."""
+    everything = np.concatenate([centers, content])
+    low, high = np.percentile(everything, (2, 98), axis=0)
+    whole = float(np.linalg.norm(high - low))
+    if len(centers) < 2:
+        return max(FRUSTUM_OF_ALL * whole, 1e-9) if whole > 0 else 1.0
+    apart = np.linalg.norm(centers[:, None] - centers, axis=2) + np.where(np.eye(len(centers), dtype=bool), np.inf, 0)
+    near = float(np.median(apart.min(1)))
+    return float(np.clip(FRUSTUM * near, 0.03 * whole, FRUSTUM_OF_ALL * whole)) or 1.0
+
+
+def _shown(scene: PosedImages, view: int) -> tuple[np.ndarray, float]:
+    """A photograph for drawing (h, w, 3) uint8, shrunk, and its pixels per pixel drawn."""
+    import cv2
+
+    image = scene.load(view)
+    height, width = image.shape[1:]
+    zoom = max(1.0, max(height, width) / LONGEST_SIDE)
+    picture = (image * 255).round().byte().permute(1, 2, 0).contiguous().numpy()
+    size = (max(1, round(width / zoom)), max(1, round(height / zoom)))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA) if zoom > 1 else picture), zoom
+
+
+def _show(axes: Axes, picture: np.ndarray, zoom: float, **options: object) -> None:
+    """Draw a picture in the pixels of its photograph."""
+    height, width = picture.shape[:2]
+    extent = (-0.5, width * zoom - 0.5, height * zoom - 0.5, -0.5)
+    axes.imshow(picture, extent=extent, **options)  # type: ignore[arg-type]
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def _matches(scene: PosedImages, examination: Examination, features: Features, title: str) -> bytes:
+    """The pair whose error is nearest to the median of all pairs, with matches and their epipolar lines."""
+    cameras, matches = examination.hypothesis.photographs, features.matches
+    medians = features.pair_medians(examination.hypothesis)
+    A = fundamental(cameras, matches.first, matches.second)
+    lined = np.abs(A).max((1, 2)) > 0
+    ranked = np.argsort(np.abs(medians - np.median(medians[lined] if lined.any() else medians)), kind="stable")
+    pair = next((int(index) for index in ranked if lined[index]), int(ranked[0]))
+    views = int(matches.first[pair]), int(matches.second[pair])
+    chosen = np.flatnonzero(matches.pair == pair)
+    distances = np.abs(sampson_distances(matches, cameras))[chosen]
+    chosen = chosen[np.linspace(0, len(chosen) - 1, min(MOST_MATCHES, len(chosen))).astype(int)]
+    pixels = matches.pixels[chosen]
+    F = A[pair]
+    figure = _figure(14, 14 * 0.5 * max(h / w for h, w in map(scene.size, views)) + 1.1, title)
+    for side, (axes, view) in enumerate(zip(figure.subplots(1, 2), views, strict=True)):
+        picture, zoom = _shown(scene, view)
+        _show(axes, picture, zoom)
+        height, width = scene.size(view)
+        other = np.concatenate([pixels[:, 1 - side], np.ones((len(pixels), 1))], 1)
+        for (x, y), line, colour in zip(
+            pixels[:, side], other @ (F if side == 0 else F.T), _colours(len(pixels)), strict=True
+        ):
+            if np.abs(line[:2]).max() > 0:
+                _draw_line(axes, line, width, height, colour)
+            axes.plot(x, y, "o", color=colour, markersize=6, markeredgecolor="white", markeredgewidth=0.8)
+        axes.set_xlim(-0.5, width - 0.5)
+        axes.set_ylim(height - 0.5, -0.5)
+        axes.set_title(f"{view}: {scene.names[view]}", fontsize=10)
+    figure.supxlabel(
+        f"{len(pixels)} of the pair's {len(distances)} matches, each on the epipolar line of its match if the cameras "
+        f"are right; median distance {np.median(distances):.3g} px",
+        fontsize=9,
+    )
+    return _png(figure)
+
+
+def _draw_line(axes: Axes, line: np.ndarray, width: int, height: int, colour: np.ndarray) -> None:
+    """The line a x + b y + c = 0 across a picture."""
+    a, b, c = line
+    if abs(b) > abs(a):
+        x = np.array([-0.5, width - 0.5])
+        axes.plot(x, -(a * x + c) / b, color=colour, linewidth=1.0)
+    else:
+        y = np.array([-0.5, height - 0.5])
+        axes.plot(-(b * y + c) / a, y, color=colour, linewidth=1.0)
+
+
+def _depth(scene: PosedImages, examination: Examination, item: DepthMaps, title: str) -> bytes:
+    """A typical view's depth, and how far the depth of its best neighbour is from it where both are known."""
+    found = seen_errors(item.surfaces, examination.hypothesis)
+    figure = _figure(14, 5.2, title)
+    left, right = figure.subplots(1, 2)
+    if found:
+        medians = {view: float(np.median(np.abs(errors))) for view, (_, _, errors) in found.items()}
+        view = min(found, key=lambda view: abs(medians[view] - float(np.median(list(medians.values())))))
+        other, known, errors = found[view]
+        picture, zoom = _shown(scene, view)
+        pixels = item.surfaces.pixels[view][known]
+        for axes, values, words in (
+            (left, item.surfaces.depths[view][known], "depth [world units]"),
+            (right, 100 * np.abs(errors), "difference [%]"),
+        ):
+            _show(axes, picture, zoom, alpha=0.5)
+            high = float(np.percentile(values, 95)) if axes is left else max(4.0, 2 * 100 * medians[view])
+            low = float(np.percentile(values, 5)) if axes is left else 0.0
+            dots = axes.scatter(
+                *pixels.T, c=values, s=7, cmap="turbo", vmin=low, vmax=max(high, low + 1e-9), linewidths=0
+            )
+            figure.colorbar(dots, ax=axes, label=words, shrink=0.85)
+        left.set_title(f"depth of view {view} ({scene.names[view]})", fontsize=10)
+        right.set_title(f"against that of view {other}: median {100 * medians[view]:.3g} %", fontsize=10)
+    else:
+        left.set_title("no view's depth falls into another view")
+        for axes in (left, right):
+            axes.axis("off")
+    return _png(figure)
+
+
+def _warp(examination: Examination, item: StereoPair, title: str) -> bytes:
+    """The pair's difference where one picture is fetched by depth, and where it is not."""
+    view = item.surfaces.views[0]
+    figure = _figure(14, 5.2, title)
+    left, right = figure.subplots(1, 2)
+    height, width = item.pictures[view].shape
+    pixels, moved, unmoved = warped(item.surfaces, examination.hypothesis, item.pictures, view)
+    for axes, values, words in ((left, unmoved, "as they are"), (right, moved, "warped by depth")):
+        _show(axes, item.pictures[view], 1.0, cmap="gray", alpha=0.5)
+        dots = axes.scatter(*pixels.T, c=values, s=7, cmap="turbo", vmin=0, vmax=60, linewidths=0)
+        figure.colorbar(dots, ax=axes, label="grey levels", shrink=0.85)
+        median = f"{np.median(values):.3g}" if len(values) else "none"
+        axes.set_title(f"difference of the two pictures {words}: median {median}", fontsize=10)
+        axes.set_xlim(-0.5, width - 0.5)
+        axes.set_ylim(height - 0.5, -0.5)
+    return _png(figure)
+
+
+def _outlines(scene: PosedImages, examination: Examination, item: Solids, title: str) -> bytes:
+    """Photographs with the border of the projected voxels, up to eight views."""
+    assert item.silhouettes is not None
+    rows = np.unique(np.linspace(0, len(item.silhouettes.views) - 1, 8).astype(int)).tolist()
+    columns = min(4, len(rows))
+    lines = int(np.ceil(len(rows) / columns))
+    figure = _figure(3.4 * columns, 3.6 * lines + 0.8, title)
+    grid = figure.subplots(lines, columns, squeeze=False).ravel()
+    for axes in grid:
+        axes.axis("off")
+    for axes, row in zip(grid, rows, strict=False):
+        view, mask, step = (values[row] for values in item.silhouettes)
+        picture, zoom = _shown(scene, view)
+        _show(axes, picture, zoom)
+        drawn = draw_solid(item.solid, examination.hypothesis.photographs, view, mask.shape, step)
+        x, y = np.arange(mask.shape[1]) * step, np.arange(mask.shape[0]) * step
+        for borders, colour in ((mask, "tab:green"), (drawn, "tab:red")):
+            if borders.any() and not borders.all():
+                axes.contour(x, y, borders.astype(float), levels=[0.5], colors=[colour], linewidths=1.2)
+        axes.set_title(f"{view}: {scene.names[view]}", fontsize=9)
+    figure.supxlabel("green: the photograph's outline; red: the voxels, projected", fontsize=9)
+    return _png(figure)

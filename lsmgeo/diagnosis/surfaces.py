@@ -1,0 +1,187 @@
+"""Depth maps under cameras: whether the surface that one view measures is where its neighbours measure it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from lsmgeo.diagnosis.geometry import Hypothesis, project
+
+if TYPE_CHECKING:
+    from lsmgeo.data import PosedImages
+
+__all__ = [
+    "Surfaces",
+    "load_surfaces",
+    "relative_errors",
+    "seen_errors",
+    "surface_points",
+    "thinned",
+    "warp_errors",
+    "warped",
+]
+
+# Pixels of a view that are carried into others, and pixels that are kept of a map.
+SAMPLES = 3000
+MAX_MAP = 1 << 20
+# Of the neighbours into which most of a view falls, the one counts that agrees best: in others it may be hidden.
+NEIGHBOURS = 4
+LEAST_SEEN = 0.02
+
+
+class Surfaces(NamedTuple):
+    """Depth of V views, thinned to every ``step``-th row and column.
+
+    Attributes:
+        maps: each view's (h, w) float64 depth, None for a view without.
+        steps: rows and columns between two kept ones.
+        pixels: each view's (N, 2) x, y of the pixels that are carried over.
+        depths: their depth.
+    """
+
+    maps: tuple[np.ndarray | None, ...]
+    steps: tuple[int, ...]
+    pixels: tuple[np.ndarray, ...]
+    depths: tuple[np.ndarray, ...]
+
+    @property
+    def views(self) -> list[int]:
+        """The views that have depth."""
+        return [view for view, values in enumerate(self.depths) if len(values)]
+
+
+def load_surfaces(scene: PosedImages, views: np.ndarray) -> Surfaces:
+    """Read the depth of some views.
+
+    Raises:
+        DataError: a file is missing, damaged or not of its camera's size.
+    """
+    maps: list[np.ndarray | None] = [None] * len(scene)
+    steps, pixels, depths = [1] * len(scene), [np.zeros((0, 2))] * len(scene), [np.zeros(0)] * len(scene)
+    for view in views.tolist():
+        loaded = scene.load_depth(view)
+        if loaded is None:
+            continue
+        depth = loaded.numpy().astype(np.float64)
+        rows, columns = np.nonzero(depth > 0)
+        # Evenly, not at random: the same pixels each time.
+        chosen = np.linspace(0, len(rows) - 1, min(SAMPLES, len(rows))).astype(int)
+        rows, columns = rows[chosen], columns[chosen]
+        pixels[view] = np.stack([columns, rows], 1).astype(np.float64)
+        depths[view] = depth[rows, columns]
+        steps[view] = int(np.ceil(np.sqrt(depth.size / MAX_MAP)))
+        maps[view] = depth[:: steps[view], :: steps[view]].copy()
+    return Surfaces(tuple(maps), tuple(steps), tuple(pixels), tuple(depths))
+
+
+def thinned(surfaces: Surfaces, most: int) -> Surfaces:
+    """The same with at most so many pixels of each view."""
+    chosen = [np.linspace(0, len(depths) - 1, min(most, len(depths))).astype(int) for depths in surfaces.depths]
+    return surfaces._replace(
+        pixels=tuple(pixels[rows] for pixels, rows in zip(surfaces.pixels, chosen, strict=True)),
+        depths=tuple(depths[rows] for depths, rows in zip(surfaces.depths, chosen, strict=True)),
+    )
+
+
+def surface_points(surfaces: Surfaces, hypothesis: Hypothesis, view: int) -> np.ndarray:
+    """Where in the world a view's chosen pixels lie, (N, 3)."""
+    K, R, t = (value[view] for value in hypothesis.beside)
+    pixels = surfaces.pixels[view]
+    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ np.linalg.inv(K).T
+    z = surfaces.depths[view] * hypothesis.depth_scale
+    if hypothesis.along_ray:
+        z = z / np.linalg.norm(rays, axis=1)
+    return np.asarray((rays * z[:, None] - t) @ np.linalg.inv(R).T)
+
+
+def _seen(surfaces: Surfaces, hypothesis: Hypothesis, points: np.ndarray, view: int) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (N,) of points in a view and what its map says there, NaN where it says nothing."""
+    maps, step = surfaces.maps[view], surfaces.steps[view]
+    assert maps is not None
+    pixels, depth = project(hypothesis.beside, view, points)
+    if hypothesis.along_ray:
+        camera = points @ hypothesis.beside.R[view].T + hypothesis.beside.t[view]
+        depth = np.sign(depth) * np.linalg.norm(camera, axis=1)
+    with np.errstate(invalid="ignore"):
+        places = np.round(pixels / step)
+        height, width = maps.shape
+        inside = (places >= 0).all(1) & (places[:, 0] < width) & (places[:, 1] < height) & (depth > 0)
+    columns, rows = np.where(inside[:, None], places, 0).astype(int).T
+    there = maps[rows, columns] * hypothesis.depth_scale
+    return depth, np.where(inside & (there > 0), there, np.nan)
+
+
+def relative_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
+    """Signed relative differences of depth, carried over against measured there, and the view carried, (M,) and (M,).
+
+    Of each view, the few neighbours are asked into which most of its pixels fall under this very hypothesis (cameras
+    that are wrong may place views anywhere), and of them the one counts that agrees best. Pixels that another surface
+    hides give large differences; the median bears them.
+    """
+    found = seen_errors(surfaces, hypothesis)
+    errors = [np.zeros(0), *(errors for _, _, errors in found.values())]
+    views = [np.zeros(0, int), *(np.full(len(errors), view) for view, (_, _, errors) in found.items())]
+    return np.concatenate(errors), np.concatenate(views)
+
+
+def seen_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> dict[int, tuple[int, np.ndarray, np.ndarray]]:
+    """For each view that falls into others: the one that counts, which pixels it knows (N,) bool, and the errors."""
+    best = {}
+    for view in surfaces.views:
+        points = surface_points(surfaces, hypothesis, view)
+        found = []
+        for other in surfaces.views:
+            if other != view:
+                depth, there = _seen(surfaces, hypothesis, points, other)
+                known = np.isfinite(there)
+                if known.mean() >= LEAST_SEEN:
+                    found.append((other, known, (depth[known] - there[known]) / there[known]))
+        found = sorted(found, key=lambda row: len(row[2]), reverse=True)[:NEIGHBOURS]
+        if found:
+            best[view] = min(found, key=lambda row: float(np.median(np.abs(row[2]))))
+    return best
+
+
+def warp_errors(
+    surfaces: Surfaces, hypothesis: Hypothesis, pictures: tuple[np.ndarray, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Differences in grey levels between each of two pictures and the other one fetched by depth, and fetched unmoved.
+
+    Args:
+        surfaces: of two views.
+        hypothesis: their cameras.
+        pictures: (H, W) grey, at the photographs' sizes.
+
+    Returns:
+        (M,) and (M,) absolute differences at the pixels that fall into the other picture.
+    """
+    each = [warped(surfaces, hypothesis, pictures, view)[1:] for view in surfaces.views]
+    moved, unmoved = (np.concatenate([np.zeros(0), *parts]) for parts in zip(*each, strict=True))
+    return moved, unmoved
+
+
+def warped(
+    surfaces: Surfaces, hypothesis: Hypothesis, pictures: tuple[np.ndarray, ...], view: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For one of two views the pixels (M, 2) that fall into the other picture, and the differences as `warp_errors`."""
+    import cv2
+
+    other = 1 - view
+    points = surface_points(surfaces, hypothesis, view)
+    pixels, depth = project(hypothesis.photographs, other, points)
+    height, width = pictures[other].shape
+    own = surfaces.pixels[view]
+    with np.errstate(invalid="ignore"):
+        inside = (pixels >= 0).all(1) & (pixels <= [width - 1, height - 1]).all(1) & (depth > 0)
+    inside &= (own <= [width - 1, height - 1]).all(1)
+    if not inside.any():
+        return np.zeros((0, 2)), np.zeros(0), np.zeros(0)
+    own = own[inside]
+    here = pictures[view][own[:, 1].astype(int), own[:, 0].astype(int)].astype(np.float64)
+    differences = []
+    for places in (pixels[inside], own):
+        maps = places.astype(np.float32)[:, None]
+        there = cv2.remap(pictures[other].astype(np.float32), maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
+        differences.append(np.abs(there[:, 0] - here))
+    return own, differences[0], differences[1]

@@ -4,6 +4,7 @@ from lsmgeo.data.binvox import read_binvox
 from lsmgeo.data.calibration import Board, CalibratedLens, Calibration, Rig, read_calibration
 from lsmgeo.data.cameras_json import read_cameras_json
 from lsmgeo.data.colmap import read_colmap
+from lsmgeo.data.convert_set import convert_set
 from lsmgeo.data.depth_files import DepthFile, DepthPng
 from lsmgeo.data.detect import FORMATS, Format, detect, open_scene
 from lsmgeo.data.files import atomic_file, read_image, write_atomic, write_point_cloud
@@ -58,6 +59,7 @@ __all__ = [
     "atomic_file",
     "check_sample",
     "collate",
+    "convert_set",
     "detect",
     "encode_sample",
     "from_trimesh",

@@ -22,7 +22,7 @@ from lsmgeo.data.shards import hash_settings, verify_shard, write_shard
 from lsmgeo.data.sources import Recipe, Source, open_source
 from lsmgeo.errors import DataError, OptionError
 
-__all__ = ["Made", "render_set"]
+__all__ = ["Made", "make_set", "render_set"]
 
 # Where workers tell how far they are, one byte a shape.
 PROGRESS = ".progress"
@@ -112,13 +112,56 @@ def render_set(
         >>> made.shapes, [path.name for path in made.shards]
         (3, ['synthetic-13-000000.tar'])
     """
-    recipe = Recipe() if recipe is None else recipe
-    _check(recipe, per_shard, jobs, on_error)
-    check_flag("render_set", "overwrite", overwrite)
+    return make_set(
+        open_source(source, shapes),
+        out,
+        Recipe() if recipe is None else recipe,
+        per_shard=per_shard,
+        jobs=jobs,
+        on_error=on_error,
+        overwrite=overwrite,
+        progress=progress,
+        who="render_set",
+        where=source,
+    )
+
+
+def make_set(
+    source: Source,
+    out: str | Path,
+    recipe: Recipe,
+    *,
+    per_shard: int,
+    jobs: int,
+    on_error: str,
+    overwrite: bool,
+    progress: bool,
+    who: str,
+    where: str | Path,
+) -> Made:
+    """Make the shards of any source; see `render_set`, whose options these are.
+
+    Args:
+        source: the shapes.
+        out: the folder for the shards.
+        recipe: as `Source.render` gets it.
+        per_shard: shapes in a shard.
+        jobs: worker processes.
+        on_error: "skip" or "raise".
+        overwrite: whether shards of other settings are made again.
+        progress: whether to show a bar.
+        who: what stands before an option's name in errors.
+        where: the source as the caller named it, for errors.
+
+    Raises:
+        OptionError, DataError: as `render_set`.
+    """
+    _check(who, recipe, per_shard, jobs, on_error)
+    check_flag(who, "overwrite", overwrite)
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise DataError(out, "is a file; the shards need a folder")
-    tasks = _tasks(open_source(source, shapes), out, recipe, per_shard, on_error)
+    tasks = _tasks(source, out, recipe, per_shard, on_error)
     _refuse_other_shards(out, tasks, overwrite)
     told = [_progress(task.path) for task in tasks]
     try:
@@ -129,7 +172,7 @@ def render_set(
         raise DataError(out, f"cannot be written ({error})") from error
     try:
         with _bar(told, tasks[-1].stop, recipe.views, progress):
-            done = _run(tasks, jobs)
+            done = _run(who, tasks, jobs)
     finally:
         with contextlib.suppress(OSError):
             for path in told:
@@ -143,22 +186,22 @@ def render_set(
     )
     if not made.shapes:
         first, reason = made.skipped[0]
-        raise DataError(source, f"holds no mesh that can be used; the first: {first}: {reason}")
+        raise DataError(where, f"holds no shape that can be used; the first: {first}: {reason}")
     return made
 
 
-def _check(recipe: Recipe, per_shard: int, jobs: int, on_error: str) -> None:
-    check_whole("render_set", "views", recipe.views, 1, MAX_VIEWS)
-    check_whole("render_set", "size", recipe.size, 1, MAX_SIDE)
-    check_whole("render_set", "seed", recipe.seed, 0, 2**32 - 1)
-    check_whole("render_set", "per_shard", per_shard, 1, MAX_SHAPES)
-    if check_whole("render_set", "jobs", jobs, -1) == 0:
-        raise OptionError("render_set: jobs must be at least 1, or -1 for all cores; got 0")
+def _check(who: str, recipe: Recipe, per_shard: int, jobs: int, on_error: str) -> None:
+    check_whole(who, "views", recipe.views, 1, MAX_VIEWS)
+    check_whole(who, "size", recipe.size, 1, MAX_SIDE)
+    check_whole(who, "seed", recipe.seed, 0, 2**32 - 1)
+    check_whole(who, "per_shard", per_shard, 1, MAX_SHAPES)
+    if check_whole(who, "jobs", jobs, -1) == 0:
+        raise OptionError(f"{who}: jobs must be at least 1, or -1 for all cores; got 0")
     for side in recipe.voxels:
-        check_whole("render_set", "voxels", side, 1, MAX_VOXELS)
+        check_whole(who, "voxels", side, 1, MAX_VOXELS)
     if len(set(recipe.voxels)) != len(recipe.voxels):
-        raise OptionError(f"render_set: voxels must be different resolutions; got {recipe.voxels!r}")
-    check_choice("render_set", "on_error", on_error, ("skip", "raise"))
+        raise OptionError(f"{who}: voxels must be different resolutions; got {recipe.voxels!r}")
+    check_choice(who, "on_error", on_error, ("skip", "raise"))
 
 
 def _tasks(source: Source, out: Path, recipe: Recipe, per_shard: int, on_error: str) -> list[_Task]:
@@ -193,13 +236,13 @@ def _recipe_hash(recipe: Recipe) -> str:
     return hash_settings(recipe._asdict())[:32]
 
 
-def _run(tasks: list[_Task], jobs: int) -> list[_Done]:
+def _run(who: str, tasks: list[_Task], jobs: int) -> list[_Done]:
     if jobs == 1:
         return [_make(task) for task in tasks]
     try:
         import joblib
     except ImportError as error:
-        raise OptionError("render_set: jobs other than 1 need joblib; install lsmgeo[data]") from error
+        raise OptionError(f"{who}: jobs other than 1 need joblib; install lsmgeo[data]") from error
     result: list[_Done] = joblib.Parallel(n_jobs=jobs)(joblib.delayed(_make)(task) for task in tasks)
     return result
 

@@ -248,7 +248,7 @@ def test_one_model_in_two_formats_is_two_shapes(tmp_path):
 def test_a_tree_without_a_usable_mesh_is_an_error(tmp_path, capsys):
     (tmp_path / "tree").mkdir()
     (tmp_path / "tree" / "model.obj").write_text("nothing")
-    with pytest.raises(DataError, match=r"no mesh that can be used.*model\.obj"):
+    with pytest.raises(DataError, match=r"no shape that can be used.*model\.obj"):
         render_set(tmp_path / "tree", tmp_path / "set", RECIPE, jobs=1)
     assert list((tmp_path / "set").iterdir()) == []
     (tmp_path / "tree" / "new\nline.obj").write_text("nothing")

@@ -4,6 +4,7 @@ ORDER = [
     "plot_one_view_unprojected.py",
     "plot_two_views_agreeing.py",
     "plot_half_pixel_mistake.py",
+    "plot_wrong_poses.py",
     "plot_plane_sweep_sphere.py",
     "plot_pose_noise.py",
     "plot_analytic_scene.py",

@@ -33,6 +33,14 @@ def test_the_half_pixel_mistake_is_as_large_as_computed(run):
     assert abs(names["wrong"].mean() - 3.5) < 1e-3
 
 
+def test_inverted_poses_are_found_and_mended(run):
+    names = run("wrong_poses")
+    assert names["findings"].verdict == "bad"
+    assert names["findings"].cause.name == "poses inverted"
+    assert names["after"].verdict == "good"
+    assert names["after"].checks[0].value < 0.2  # px; as features go
+
+
 def test_the_sweep_meets_the_sphere_within_a_tenth_of_a_plane(run):
     names = run("plane_sweep_sphere")
     assert names["error"][names["surface"]].max() < 0.1 * names["spacing"]

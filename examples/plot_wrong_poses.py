@@ -70,7 +70,7 @@ print(
 )
 
 # %%
-# From above: the cross is what they look at. Inverted, cameras of a ring stand closer together, somewhere else, and look elsewhere.
+# From above; the cross is what they look at. Inverted, the cameras of a ring stand closer together, somewhere else.
 
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained", width_ratios=(1.3, 1, 1))
 axes[0].imshow(picture.images[0, 2].movedim(0, -1))

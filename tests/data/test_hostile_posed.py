@@ -137,10 +137,22 @@ def test_numbers_of_transforms_are_numbers(tmp_path, value):
         frame = values["frames"][1]
         if key == "camera_angle_x":
             del frame["fl_x"], frame["fl_y"]
-        frame["depth_file_path"] = "depth.png"
+        if key == "depth_unit_scale_factor":
+            frame["depth_file_path"] = "depth.png"
         frame[key] = value
         file.write_text(json.dumps(values).replace("Infinity", "1e999"))
-        refused(tmp_path)
+        refused(tmp_path, f"{key} must|focal lengths must be positive")
+
+
+@pytest.mark.parametrize("form", ["transforms", "cameras"])
+def test_a_key_said_twice_is_refused(tmp_path, form):
+    (file,) = write(form, tmp_path)
+    text = file.read_text()
+    assert len(read_all(tmp_path)) == 2
+    for key in ("w", "transform_matrix", "frames") if form == "transforms" else ("width", "K", "version"):
+        at = text.index(f'"{key}": ')
+        file.write_text(f'{text[:at]}"{key}": 1, {text[at:]}')
+        refused(tmp_path, "says a key twice")
 
 
 @pytest.mark.parametrize("value", [1e999, 10**400, True, "5", None, [], 1e13], ids=lambda value: str(value)[:9])

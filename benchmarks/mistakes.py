@@ -101,8 +101,11 @@ def _with_cameras(scene: PosedImages, field: str, change: Callable[[np.ndarray],
 
 
 def _shuffled(scene: PosedImages) -> PosedImages:
-    """Every photograph, with its depth, beside the camera of another one."""
-    order = _another(len(scene))
+    """Photographs, with their depth, beside cameras of others; a camera of another size would be refused at once."""
+    sizes = [scene.size(view) for view in range(len(scene))]
+    alike = np.array([view for view, size in enumerate(sizes) if sizes.count(size) == max(map(sizes.count, sizes))])
+    order = np.arange(len(scene))
+    order[alike] = alike[_another(len(alike))]
     names, paths = ([items[index] for index in order] for items in (scene.names, scene.paths))
     depths = None if scene.depths is None else tuple(scene.depths[index] for index in order)
     return replace(scene, names=tuple(names), paths=tuple(paths), depths=depths)

@@ -103,7 +103,7 @@ def _with_cameras(scene: PosedImages, field: str, change: Callable[[np.ndarray],
 def _shuffled(scene: PosedImages) -> PosedImages:
     """Photographs, with their depth, beside cameras of others; a camera of another size would be refused at once."""
     sizes = [scene.size(view) for view in range(len(scene))]
-    alike = np.array([view for view, size in enumerate(sizes) if sizes.count(size) == max(map(sizes.count, sizes))])
+    alike = np.array([view for view, size in enumerate(sizes) if size == max(sizes, key=sizes.count)])
     order = np.arange(len(scene))
     order[alike] = alike[_another(len(alike))]
     names, paths = ([items[index] for index in order] for items in (scene.names, scene.paths))

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from contextlib import ExitStack
 
+    from lsmgeo.data import Made
+
 __all__ = ["convert", "demo", "info", "main", "reconstruct", "render"]
 
 KINDS = {"int": "a whole number", "float": "a finite number"}
@@ -210,8 +212,6 @@ def render(
     """
     import contextlib
     import time
-    from importlib.util import find_spec
-    from pathlib import Path
 
     from lsmgeo.data import Recipe, render_set
     from lsmgeo.errors import OptionError
@@ -219,9 +219,6 @@ def render(
     if not re.fullmatch(r"[0-9]+(,[0-9]+)*", voxels):
         raise OptionError(f"render: voxels must be whole numbers with commas between, such as 32,64; got {voxels!r}")
     sides = tuple(int(side[:6]) for side in voxels.split(","))
-    if jobs == -1 and cluster is None and not find_spec("joblib"):
-        print("lsmgeo: one process works; pip install 'lsmgeo[data]' lets all cores work", file=sys.stderr)
-        jobs = 1
     start = time.perf_counter()
     with contextlib.ExitStack() as stack:
         if cluster is not None:
@@ -232,20 +229,40 @@ def render(
             Recipe(seed, views, size, sides, depth, shadows),
             shapes=shapes,
             per_shard=per_shard,
-            jobs=jobs,
+            jobs=_jobs(jobs) if cluster is None else jobs,
             on_error=on_error,
             overwrite=overwrite,
             progress=True,
         )
     seconds = time.perf_counter() - start
-    megabytes = sum(path.stat().st_size for path in made.shards) / 1e6
     print(f"shapes:   {made.shapes}, {views} views each at {size} x {size}")
-    print(f"shards:   {len(made.shards)} in {Path(out).resolve()}, {megabytes:.0f} MB; {made.kept} were there already")
+    _print_shards(made, out)
     if made.kept < len(made.shards):
         fresh = "" if made.kept else f", {made.shapes * views / seconds:.0f} views a second"
         print(f"time:     {seconds:.1f} s{fresh}")
+    _print_skipped(made, "meshes")
+
+
+def _jobs(jobs: int) -> int:
+    """All cores where joblib is there to let them work, else one."""
+    from importlib.util import find_spec
+
+    if jobs == -1 and not find_spec("joblib"):
+        print("lsmgeo: one process works; pip install 'lsmgeo[data]' lets all cores work", file=sys.stderr)
+        return 1
+    return jobs
+
+
+def _print_shards(made: Made, out: str) -> None:
+    from pathlib import Path
+
+    megabytes = sum(path.stat().st_size for path in made.shards) / 1e6
+    print(f"shards:   {len(made.shards)} in {Path(out).resolve()}, {megabytes:.0f} MB; {made.kept} were there already")
+
+
+def _print_skipped(made: Made, what: str) -> None:
     if made.skipped:
-        print(f"skipped:  {len(made.skipped)} meshes that cannot be used")
+        print(f"skipped:  {len(made.skipped)} {what} that cannot be used")
         for path, reason in made.skipped[:MOST_SKIPPED]:
             print(f"          {path}: {reason}")
         if len(made.skipped) > MOST_SKIPPED:
@@ -270,19 +287,31 @@ def _join(address: str, stack: ExitStack) -> None:
 
 def convert(
     scene: str,
-    to: Literal["colmap", "transforms", "cameras"] = "colmap",
+    to: Literal["colmap", "transforms", "cameras", "shards"] = "colmap",
     out: str = "lsmgeo-convert",
+    splits: str | None = None,
+    jobs: int = -1,
 ) -> None:
     """Write posed photographs in the form that another program reads, straightened where their lens bent them.
 
     Args:
-        scene: posed photographs in any form that lsmgeo reads.
+        scene: posed photographs in any form that lsmgeo reads; for shards, a whole tree of the LSM release or of
+            3D-R2N2's renderings.
         to: "colmap" is a COLMAP model as text, "transforms" a transforms.json of instant-ngp and nerfstudio, "cameras"
-            a plain JSON of K and world-to-camera matrices.
-        out: folder to make for the photographs and their cameras; it must not exist or be empty.
+            a plain JSON of K and world-to-camera matrices; "shards" is a training set, as lsmgeo render makes it.
+        out: folder to make for the photographs and their cameras; it must not exist or be empty. Run again, shards go
+            on where they were.
+        splits: for shards, a splits.json that says what is trained on; by default names decide.
+        jobs: for shards, worker processes; -1 takes all cores.
     """
     from lsmgeo import data
 
+    if to == "shards":
+        made = data.convert_set(scene, out, splits=splits, jobs=_jobs(jobs), progress=True)
+        print(f"objects:  {made.shapes}")
+        _print_shards(made, out)
+        _print_skipped(made, "objects")
+        return
     images = data.open(scene)
     write = {"colmap": data.write_colmap, "transforms": data.write_transforms, "cameras": data.write_cameras_json}[to]
     folder = write(images, out)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from lsmgeo import data
+from lsmgeo import cli, data
 from lsmgeo.data.object_trees import read_splits
 from lsmgeo.data.sources import split_by_name
 from lsmgeo.errors import DataError, OptionError
@@ -170,6 +170,22 @@ def test_published_splits(written, tmp_path):
     shards = data.ShardSet(tmp_path / "named")
     for name in NAMES:
         assert name in data.ShapeDataset(shards, split=split_by_name(name), views=1).names
+
+
+def test_the_command(written, tmp_path, capsys):
+    file = tmp_path / "splits.json"
+    file.write_text(json.dumps(SPLITS))
+    out = tmp_path / "set"
+    arguments = ["convert", str(written), "--to", "shards", "--out", str(out), "--splits", str(file), "--jobs", "1"]
+    assert cli.main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "objects:  3\n" in printed
+    assert f"shards:   1 in {out.resolve()}" in printed
+    assert "skipped:  1 objects that cannot be used" in printed
+    assert "is in no part of" in printed
+    file.write_text("{")
+    assert cli.main(arguments) == 2
+    assert f"lsmgeo: error: {file}: is not JSON" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

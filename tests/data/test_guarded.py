@@ -1,7 +1,6 @@
 """Workers that misbehave in every way: each becomes a DataError that names the file, and nothing else happens."""
 
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -61,12 +60,11 @@ def test_a_crash_is_an_error_of_the_file(tmp_path, script, match):
     refused(tmp_path, script, match)
 
 
+@pytest.mark.timeout(50)  # the first alone would take a minute
 def test_time_is_limited(tmp_path):
-    start = time.monotonic()
     refused(tmp_path, "import time; time.sleep(60)", "more than 0.5 seconds", seconds=0.5)
     refused(tmp_path, "while True: pass", "more than 0.5 seconds", seconds=0.5)
     refused(tmp_path, "import sys; print('x', flush=True); sys.stdin.close()\nwhile True: pass", "0.5", seconds=0.5)
-    assert time.monotonic() - start < 20  # of minutes
 
 
 def test_an_answer_without_end_is_cut(tmp_path):

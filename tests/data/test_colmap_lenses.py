@@ -112,6 +112,21 @@ def test_every_camera_reads_back(scene, tmp_path, model, form):
     assert min(counts) > 15
 
 
+def test_an_observation_that_cannot_be_straightened_is_left_out(scene, tmp_path):
+    write(scene, tmp_path, "SIMPLE_RADIAL", MODELS["SIMPLE_RADIAL"][0], "txt")
+    before = data.open(tmp_path).points.observations
+    file = tmp_path / "sparse" / "0" / "images.txt"
+    lines = file.read_text().splitlines()
+    row = next(index for index, line in enumerate(lines) if line.endswith("v1.png")) + 1
+    x, _, point, rest = lines[row].split(maxsplit=3)
+    lines[row] = f"{x} 999.5 {point} {rest}"
+    file.write_text("\n".join(lines) + "\n")
+    after = data.open(tmp_path).points.observations
+    np.testing.assert_array_equal(after[1].points, before[1].points[1:])
+    np.testing.assert_array_equal(after[1].pixels, before[1].pixels[1:])
+    np.testing.assert_array_equal(after[0].points, before[0].points)
+
+
 @pytest.mark.parametrize(
     ("model", "parameters"), [("SIMPLE_RADIAL", [151.0, 47, 37, 0.0]), ("OPENCV", [151.0, 150, 47, 37, 0, 0, 0, 0])]
 )

@@ -12,7 +12,7 @@ from lsmgeo.diagnosis.findings import Check
 from lsmgeo.diagnosis.limits import CENTRED, LIMITS, pixel_limit
 from lsmgeo.diagnosis.matching import Matches, grey_picture, match_features
 from lsmgeo.diagnosis.outlines import epipolar_tangency, outline
-from lsmgeo.diagnosis.silhouettes import load_silhouettes, occupied_centers, overlap, within_a_cell
+from lsmgeo.diagnosis.silhouettes import load_silhouettes, near_cells, occupied_centers, overlap, within_a_cell
 from lsmgeo.diagnosis.sparse import reprojection_errors
 from lsmgeo.diagnosis.surfaces import (
     Surfaces,
@@ -46,7 +46,7 @@ LEAST_OBSERVATIONS = 20
 # Matches of a pair, and pairs of outlines, that a hypothesis is tried on.
 MATCHES_TRIED = 100
 OUTLINE_PAIRS, OUTLINE_PAIRS_TRIED = 300, 60
-PIXELS_TRIED = 400
+PIXELS_TRIED, VIEWS_TRIED = 400, 12
 
 
 class Evidence(Protocol):
@@ -148,7 +148,7 @@ class DepthMaps:
 
     def __init__(self, scene: PosedImages, views: np.ndarray) -> None:
         self.surfaces = load_surfaces(scene, views)
-        self.tried = thinned(self.surfaces, PIXELS_TRIED)
+        self.tried = thinned(self.surfaces, PIXELS_TRIED, VIEWS_TRIED)
 
     def __bool__(self) -> bool:
         return len(self.surfaces.views) >= 2
@@ -248,7 +248,7 @@ class Solids:
 
     def __init__(self, scene: PosedImages, views: np.ndarray) -> None:
         assert scene.voxels is not None
-        self.voxels = scene.voxels
+        self.near, self.lattice = near_cells(scene.voxels)
         self.solid = occupied_centers(scene.voxels)
         self.silhouettes = load_silhouettes(scene, views) if scene.cut_out else None
         self.surfaces = load_surfaces(scene, views) if scene.depths is not None else None
@@ -271,7 +271,7 @@ class Solids:
             checks.append(Check(name, value, "%", LIMITS["overlap"], views, "views", at_least=True))
         if self.surfaces is not None and self.surfaces.views:
             points = np.concatenate([surface_points(self.surfaces, hypothesis, view) for view in self.surfaces.views])
-            value = 100 * within_a_cell(points, self.voxels)
+            value = 100 * float(within_a_cell(points, self.near, self.lattice))
             name = "depth points within a cell of the voxels"
             checks.append(Check(name, value, "%", LIMITS["near a cell"], len(points), "points", at_least=True))
         return checks

@@ -44,8 +44,8 @@ COMMON = (
     "depth along the ray",
     "poses inverted and OpenGL axes",
 )
-DEPTH_SCALES = np.geomspace(1e-3, 1e3, 121)
-NEAR = 0.01
+DEPTH_SCALES = np.geomspace(1e-3, 1e3, 41)
+NEAR = 0.02
 NICE = (0.001, 0.01, 0.1, 0.125, 0.2, 0.25, 1 / 3, 0.5, 2 / 3, 0.75, 1.5, 2.0, 3.0, 4.0, 5.0, 8.0, 10.0, 100.0, 1000.0)
 
 
@@ -98,7 +98,12 @@ def explain(
         The explanation, None where there is none; and the names of all mistakes that were tried.
     """
     quick = [item for item in evidence if not item.slow] or list(evidence)
+    before = _measured(evidence, asis)
     with_depth = [item for item in evidence if getattr(item, "surfaces", None) is not None]
+    others = [item for item in evidence if item not in with_depth]
+    # What fails without any depth is not explained by it.
+    if not all(check.passed for check in _measured(others, asis)):
+        with_depth = []
     candidates = [*camera_mistakes(asis, sizes), *resolution_mistakes(asis, sizes)]
     candidates += order_mistakes(asis, names, evidence, views)
     candidates += depth_mistakes(asis) if with_depth else []
@@ -112,7 +117,6 @@ def explain(
     finalists = [candidates[index] for index in order[:FINALISTS]]
     # What concerns depth alone looks the same to quick evidence.
     finalists += [candidate for candidate in candidates if candidate.name.startswith("depth")]
-    before = _measured(evidence, asis)
     decisive = []
     for candidate in {id(candidate): candidate for candidate in finalists}.values():
         after = _measured(evidence, candidate.hypothesis)

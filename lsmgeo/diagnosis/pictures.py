@@ -26,7 +26,7 @@ __all__ = ["draw_examination"]
 DPI = 90
 MOST_POINTS, MOST_MATCHES = 4000, 12
 # Up to so many cameras have their numbers written beside them.
-MOST_NUMBERS = 60
+MOST_NUMBERS, NUMBERS_APART = 100, 0.022
 LONGEST_SIDE = 900
 # Frusta are this long, as a part of the way to the nearest other camera and of the whole.
 FRUSTUM, FRUSTUM_OF_ALL = 0.6, 0.12
@@ -82,14 +82,11 @@ def _colours(count: int) -> np.ndarray:
 
 
 def _cameras(scene: PosedImages, examination: Examination, title: str) -> bytes:
-    """Cameras from above and from aside; "above" is the mean of the cameras' own up."""
+    """Cameras from above and from aside."""
     cameras = examination.hypothesis.photographs
     content, colours = _content(scene, examination)
     # Axes of the drawing: across, up, and towards the viewer who looks from above.
-    up = -cameras.R[:, 1].mean(0)
-    if np.linalg.norm(up) < 0.2:
-        up = -cameras.R[0, 1]
-    up = up / np.linalg.norm(up)
+    up = _up(cameras)
     front = np.eye(3)[np.argmin(np.abs(up))]
     across = np.cross(up, front)
     across /= np.linalg.norm(across)
@@ -104,6 +101,18 @@ def _cameras(scene: PosedImages, examination: Examination, title: str) -> bytes:
         tilt = np.array([[1, 0, 0], [0, np.sin(angle), np.cos(angle)], [0, -np.cos(angle), np.sin(angle)]])
         _draw_cameras(axes, cameras, content, colours, tilt @ system, sizes)
     return _png(figure)
+
+
+def _up(cameras: Geometry) -> np.ndarray:
+    """The normal of the ring that cameras make around something, or else the mean of their own up."""
+    up = -cameras.R[:, 1].mean(0)
+    if np.linalg.norm(up) < 0.2:
+        up = -cameras.R[0, 1]
+    centers = cameras.centers
+    _, spread, axes = np.linalg.svd(centers - centers.mean(0), full_matrices=False)
+    if len(centers) > 3 and spread[2] < 0.3 * spread[1] and spread[1] > 0.3 * spread[0]:
+        up = axes[2] * (np.sign(axes[2] @ up) or 1.0)
+    return np.asarray(up / np.linalg.norm(up))
 
 
 def _content(scene: PosedImages, examination: Examination) -> tuple[np.ndarray, np.ndarray | str]:
@@ -160,13 +169,14 @@ def _draw_cameras(
         along = np.stack([placed[view, :2], placed[view, :2] + 1.8 * (ends[4, :2] - placed[view, :2])])
         axes.add_collection(LineCollection([along], colors=[colour], linewidths=0.7, linestyles="dotted"))
         axes.add_collection(LineCollection([corner[:2]], colors=[colour], linewidths=2.4))
-    _number(axes, placed, length)
     limits = [np.concatenate(places)[:, :2]]
     if len(content):
         limits.append(np.percentile(seen[:, :2], (2, 98), axis=0))
     everything = np.concatenate(limits)
     low, high = everything.min(0), everything.max(0)
-    margin = 0.06 * (high - low).max() + 1e-12
+    span = float((high - low).max()) + 1e-12
+    margin = 0.1 * span
+    _number(axes, placed, length, span)
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
     axes.set_aspect("equal")
@@ -174,15 +184,19 @@ def _draw_cameras(
     axes.set_xlabel("world units; thick: the upper side of the picture; dotted: the optical axis", fontsize=8)
 
 
-def _number(axes: Axes, placed: np.ndarray, length: float) -> None:
+def _number(axes: Axes, placed: np.ndarray, length: float, span: float) -> None:
     """Numbers outside the ring that cameras often make; of very many, every few."""
     step = int(np.ceil(len(placed) / MOST_NUMBERS))
+    written: list[np.ndarray] = []
     middle = placed[:, :2].mean(0)
     for view in range(0, len(placed), step):
         away = placed[view, :2] - middle
         away = away / max(float(np.linalg.norm(away)), 1e-12)
-        x, y = placed[view, :2] + 0.35 * length * away
-        axes.text(x, y, str(view), fontsize=8, ha="center", va="center")
+        place = placed[view, :2] + 0.35 * length * away
+        # Numbers on top of each other say less than one.
+        if all(np.abs((place - other) / span).max() > NUMBERS_APART for other in written):
+            axes.text(float(place[0]), float(place[1]), str(view), fontsize=8, ha="center", va="center")
+            written.append(place)
 
 
 def _frustum_length(centers: np.ndarray, content: np.ndarray) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -12,11 +11,21 @@ from lsmgeo.diagnosis.geometry import Geometry, project
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages, Voxels
 
-__all__ = ["Silhouettes", "Solid", "draw_solid", "load_silhouettes", "occupied_centers", "overlap", "within_a_cell"]
+__all__ = [
+    "Silhouettes",
+    "Solid",
+    "draw_solid",
+    "load_silhouettes",
+    "near_cells",
+    "occupied_centers",
+    "overlap",
+    "within_a_cell",
+]
 
 # Cells that are projected, at most; and pixels of the longer side of a mask that they are compared with.
 MAX_CELLS = 1 << 15
 LONGEST_SIDE = 256
+MARGIN = 2  # empty cells on each side
 HALF_DIAGONAL = 0.75**0.5  # of a cube of side 1
 
 
@@ -107,16 +116,19 @@ def overlap(silhouettes: Silhouettes, solid: Solid, geometry: Geometry) -> tuple
     return np.array(recalls), np.array(unions)
 
 
-def within_a_cell(points: np.ndarray, voxels: Voxels) -> float:
-    """The fraction of points (N, 3) whose cell, or one of its 26 neighbours, is occupied; NaN for no points."""
-    if len(points) == 0:
-        return float("nan")
+def near_cells(voxels: Voxels) -> tuple[np.ndarray, np.ndarray]:
+    """Cells that are occupied or touch one that is, two more on each side than there are; and world_from_lattice."""
     T = voxels.grid.world_from_lattice.double().reshape(-1, 4, 4)[0].numpy()
-    padded = np.pad(voxels.occupancy.numpy(), 2).astype(np.uint8)
-    shifts = itertools.product((-1, 0, 1), repeat=3)
-    near = np.maximum.reduce([np.roll(padded, shift, (0, 1, 2)) for shift in shifts])
-    index = np.round((points - T[:3, 3]) @ np.linalg.inv(T[:3, :3]).T)[:, ::-1] + 2
-    shape = np.array(near.shape)
-    inside = (index >= 0).all(1) & (index < shape).all(1)
+    near = np.pad(voxels.occupancy.numpy(), MARGIN)
+    for axis in range(3):
+        near = near | np.roll(near, 1, axis) | np.roll(near, -1, axis)
+    return near, T
+
+
+def within_a_cell(points: np.ndarray, near: np.ndarray, world_from_lattice: np.ndarray) -> float:
+    """The fraction of points (N, 3) whose cell, or one of its 26 neighbours, is occupied; see `near_cells`."""
+    T = world_from_lattice
+    index = np.round((points - T[:3, 3]) @ np.linalg.inv(T[:3, :3]).T)[:, ::-1] + MARGIN
+    inside = (index >= 0).all(1) & (index < np.array(near.shape)).all(1)
     places = np.where(inside[:, None], index, 0).astype(int)
-    return float(np.mean(inside & (near[tuple(places.T)] > 0)))
+    return float(np.mean(inside & near[tuple(places.T)]))

@@ -47,8 +47,13 @@ class Surfaces(NamedTuple):
 
     @property
     def views(self) -> list[int]:
-        """The views that have depth."""
+        """The views of which pixels are carried over."""
         return [view for view, values in enumerate(self.depths) if len(values)]
+
+    @property
+    def targets(self) -> list[int]:
+        """The views into which they may fall."""
+        return [view for view, values in enumerate(self.maps) if values is not None]
 
 
 def load_surfaces(scene: PosedImages, views: np.ndarray) -> Surfaces:
@@ -75,13 +80,16 @@ def load_surfaces(scene: PosedImages, views: np.ndarray) -> Surfaces:
     return Surfaces(tuple(maps), tuple(steps), tuple(pixels), tuple(depths))
 
 
-def thinned(surfaces: Surfaces, most: int) -> Surfaces:
-    """The same with at most so many pixels of each view."""
-    chosen = [np.linspace(0, len(depths) - 1, min(most, len(depths))).astype(int) for depths in surfaces.depths]
-    return surfaces._replace(
-        pixels=tuple(pixels[rows] for pixels, rows in zip(surfaces.pixels, chosen, strict=True)),
-        depths=tuple(depths[rows] for depths, rows in zip(surfaces.depths, chosen, strict=True)),
-    )
+def thinned(surfaces: Surfaces, most: int, most_views: int) -> Surfaces:
+    """The same with at most so many pixels of so many views carried over, evenly chosen, into all the views."""
+    views = np.array(surfaces.views)
+    kept = set(views[np.linspace(0, len(views) - 1, min(most_views, len(views))).astype(int)].tolist())
+    pixels, depths = [], []
+    for view, (each, depth) in enumerate(zip(surfaces.pixels, surfaces.depths, strict=True)):
+        rows = np.linspace(0, len(depth) - 1, min(most, len(depth)) if view in kept else 0).astype(int)
+        pixels.append(each[rows])
+        depths.append(depth[rows])
+    return surfaces._replace(pixels=tuple(pixels), depths=tuple(depths))
 
 
 def surface_points(surfaces: Surfaces, hypothesis: Hypothesis, view: int) -> np.ndarray:
@@ -131,7 +139,7 @@ def seen_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> dict[int, tuple[i
     for view in surfaces.views:
         points = surface_points(surfaces, hypothesis, view)
         found = []
-        for other in surfaces.views:
+        for other in surfaces.targets:
             if other != view:
                 depth, there = _seen(surfaces, hypothesis, points, other)
                 known = np.isfinite(there)

@@ -98,7 +98,7 @@ def reconstruct(
     """Reconstruct what one of a scene's posed photographs sees: depth, coloured points, and a summary picture.
 
     Args:
-        scene: folder with a Middlebury *_par.txt or a COLMAP model of undistorted photographs.
+        scene: posed photographs in any form that lsmgeo reads.
         method: "sweep" is plane-sweep stereo.
         view: the reference photograph, its number (by name, from 0) or its name.
         out: folder for the results; created where it does not exist.

@@ -60,6 +60,7 @@ def test_pixels_that_the_model_cannot_lead_back_are_nowhere():
     [
         ("perspective", (-0.9, 0.0, 0.0, 0.0), 0.5),
         ("perspective", (1e6, -1e6, 0.0, 0.0), 1),
+        ("perspective", (-0.73, 0.12, 0.0, 0.05), 1),
         ("fisheye", (0.0, 0.0, 0.0, 0.0), 0.2),
         ("fisheye", (-5.0, 0.0, 0.0, 0.0), 0.7),
     ],

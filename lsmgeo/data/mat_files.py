@@ -39,8 +39,9 @@ MAX_SIDE = 128
 def read_mats(paths: Sequence[Path]) -> list[Arrays | DataError]:
     """Read K, extrinsic and Volume from MATLAB files, as far as each holds them.
 
-    All files go to one process, as starting it takes longer than reading a thousand. Where it dies, the files are
-    halved until the one that killed it is found.
+    All files go to one process, as starting it takes longer than reading a thousand; its children do the reading, and
+    die of a file that is made for it. Where the process itself dies, the files are halved until the one that killed it
+    is found.
 
     Args:
         paths: MATLAB files up to version 7.2.

@@ -12,6 +12,7 @@ from scipy.io import loadmat, savemat
 
 from lsmgeo import data
 from lsmgeo.data import mat_files
+from lsmgeo.data.guarded import run_guarded
 from lsmgeo.data.mat_files import read_mats
 from lsmgeo.errors import DataError, OptionError
 from tests.data.hostile import mutated
@@ -238,7 +239,8 @@ def test_links_and_other_pictures_are_refused(folder, tmp_path):
     refused(folder, "not a readable", "render_3.png")
 
 
-def damage(tmp_path, count):
+def test_damaged_matlab_files_are_refused_or_read(tmp_path):
+    count = 2000
     rng = np.random.default_rng(0)
     originals = [mat(camera()), mat({"Volume": ball_voxels(32).astype(np.uint8)}, do_compression=True)]
     paths = []
@@ -260,14 +262,25 @@ def damage(tmp_path, count):
     assert sorted(tmp_path.iterdir()) == sorted(paths)
 
 
-def test_damaged_matlab_files_are_refused_or_read(tmp_path):
-    damage(tmp_path, 60)
+def test_the_file_that_ends_the_whole_process_is_found(tmp_path, monkeypatch):
+    """As where a system has no children, or all time is spent on one file."""
+    paths = [tmp_path / f"{number}.mat" for number in range(9)]
+    for path in paths:
+        path.write_bytes(mat(camera()))
+    paths[5].write_bytes(b"poison")
+    sizes = []
 
+    def run(worker, content, *, path, **limits):
+        sizes.append(len(content))
+        if b"poison" in content:
+            raise DataError(path, "took its parser more than 60 seconds")
+        return run_guarded(worker, content, path=path, **limits)
 
-@pytest.mark.long
-@pytest.mark.timeout(3600)
-def test_many_damaged_matlab_files_are_refused_or_read(tmp_path):
-    damage(tmp_path, 2000)
+    monkeypatch.setattr(mat_files, "run_guarded", run)
+    found = read_mats(paths)
+    assert [path for path, one in zip(paths, found, strict=True) if isinstance(one, DataError)] == [paths[5]]
+    assert (found[5].path, found[5].reason) == (paths[5], "took its parser more than 60 seconds")
+    assert len(sizes) == 7  # all nine, then the halves of 9, 5 and 2 that hold it
 
 
 def test_the_answer_of_a_process_is_checked(tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from lsmgeo.diagnosis.geometry import Geometry, fundamental, relative
 if TYPE_CHECKING:
     from lsmgeo.diagnosis.matching import Matches
 
-__all__ = ["in_front", "pair_distances", "sampson_distances"]
+__all__ = ["in_front", "pair_distances", "residuals", "sampson_distances"]
 
 # Rays nearer to parallel than this many pixels meet nowhere certain.
 LEAST_PARALLAX = 5.0
@@ -27,6 +27,22 @@ def sampson_distances(matches: Matches, geometry: Geometry) -> np.ndarray:
     A, b = relative(geometry, matches.first, matches.second)
     F = fundamental(geometry, matches.first, matches.second)
     return _distances(matches.pixels, F[matches.pair], _homographies(geometry, matches, A, b)[matches.pair])
+
+
+def residuals(matches: Matches, geometry: Geometry) -> np.ndarray:
+    """What vanishes and changes its sign where matches agree, (M, 2) px: `sampson_distances` and zero.
+
+    Of cameras in one place, both coordinates of half the way between a pixel and the other's image.
+    """
+    A, b = relative(geometry, matches.first, matches.second)
+    H = _homographies(geometry, matches, A, b)[matches.pair]
+    found = np.stack([sampson_distances(matches, geometry), np.zeros(len(matches.pair))], 1)
+    still = np.isfinite(H[:, 0, 0])
+    if still.any():
+        first, second = matches.pixels[still, 0], matches.pixels[still, 1]
+        moved = (H[still] @ np.concatenate([first, np.ones((len(first), 1))], 1)[..., None])[..., 0]
+        found[still] = 0.5 * np.nan_to_num(moved[:, :2] / moved[:, 2:] - second, nan=1e9)
+    return found
 
 
 def pair_distances(pixels: np.ndarray, geometry: Geometry, first: np.ndarray, second: np.ndarray) -> np.ndarray:

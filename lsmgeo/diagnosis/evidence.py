@@ -43,6 +43,7 @@ __all__ = [
 
 LEAST_WITH_PARALLAX = 30
 LEAST_OBSERVATIONS = 20
+LEAST_PAIRS = 3
 # Matches of a pair, and pairs of outlines, that a hypothesis is tried on.
 MATCHES_TRIED = 100
 OUTLINE_PAIRS, OUTLINE_PAIRS_TRIED = 300, 60
@@ -93,6 +94,11 @@ class Features:
         distances = np.abs(sampson_distances(matches, hypothesis.photographs))
         name = "epipolar error of matched features"
         checks = [Check(name, float(np.median(distances)), "px", self.limit, len(distances), "matches")]
+        if len(matches.first) >= LEAST_PAIRS:
+            # The median bears a few photographs at wrong cameras; this does not.
+            agree = 100 * float(np.mean(_medians(distances, matches) <= LIMITS["view"] * self.limit))
+            name = "pairs of photographs that agree"
+            checks.append(Check(name, agree, "%", LIMITS["pairs"], len(matches.first), "pairs", at_least=True))
         if self.judges_sides:
             front = in_front(matches, hypothesis.photographs)
             front = front[np.isfinite(front)]
@@ -103,9 +109,12 @@ class Features:
 
     def pair_medians(self, hypothesis: Hypothesis) -> np.ndarray:
         """Median distance of each pair of views, (P,) px."""
-        distances = np.abs(sampson_distances(self.matches, hypothesis.photographs))
-        bounds = np.searchsorted(self.matches.pair, np.arange(len(self.matches.first) + 1))
-        return np.array([np.median(distances[a:b]) for a, b in itertools.pairwise(bounds)])
+        return _medians(np.abs(sampson_distances(self.matches, hypothesis.photographs)), self.matches)
+
+
+def _medians(distances: np.ndarray, matches: Matches) -> np.ndarray:
+    bounds = np.searchsorted(matches.pair, np.arange(len(matches.first) + 1))
+    return np.array([np.median(distances[a:b]) for a, b in itertools.pairwise(bounds)])
 
 
 class Points:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.epipolar import sampson_distances
+from lsmgeo.diagnosis.epipolar import residuals
 from lsmgeo.diagnosis.evidence import Features, Outlines, Points
 from lsmgeo.diagnosis.sparse import reprojections
 
@@ -23,9 +23,10 @@ ITERATIONS = 20
 # Real calibrations are off by so much, px, and more by chance: half a pixel has to be this much likelier than none.
 SYSTEMATIC, LEAST_GAIN = 0.12, 9.0
 # Shifts less certain than this, px, tell nothing of half a pixel along both axes.
-LARGEST_ERROR = 0.3
+LARGEST_ERROR = 0.35
 # Errors of the views' own calibration are told from a common one by leaving views out: fewer tell nothing.
 LEAST_VIEWS = 4
+LARGEST_SLOPE = 10.0  # an epipole nearby
 LEAST_OBSERVED, LEAST_RESIDUALS = 10, 30
 DIAGONAL = np.linspace(-1.0, 1.0, 9)
 FARTHEST_TANGENT = 1.0  # px
@@ -56,9 +57,10 @@ def find_shifts(evidence: Sequence[Evidence], cameras: Geometry) -> list[Shift]:
         if isinstance(item, Points):
             found.append(_shift_of_points(item, cameras))
         elif isinstance(item, Features):
-            residuals = [sampson_distances(item.matches, cameras.shifted(*step)) for step in _STEPS]
+            steps = np.stack([residuals(item.matches, cameras.shifted(*step)) for step in _STEPS])
             views = np.stack([item.matches.first, item.matches.second], 1)
-            found.append(_fitted("matched features", np.stack(residuals), item.matches.pair, views))
+            pair = np.repeat(item.matches.pair, 2)
+            found.append(_fitted("matched features", steps.reshape(len(steps), -1), pair, views))
         elif isinstance(item, Outlines):
             found.append(_shift_of_outlines(item, cameras))
     return [shift for shift in found if shift is not None]
@@ -136,18 +138,19 @@ def _left_out(without: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt((len(without) - 1) / len(without) * (spread**2).sum(0)) + 1e-6)
 
 
-def _fitted(told_by: str, residuals: np.ndarray, pair: np.ndarray, views: np.ndarray) -> Shift | None:
+def _fitted(told_by: str, found: np.ndarray, pair: np.ndarray, views: np.ndarray) -> Shift | None:
     """The shift that makes signed residuals least, with robust weights; its errors by leaving out views.
 
     Args:
         told_by: what the residuals are of.
-        residuals: (5, M) at no shift and at the steps along +x, -x, +y, -y.
+        found: (5, M) residuals at no shift and at the steps along +x, -x, +y, -y.
         pair: (M,) which pair of views each one is of.
         views: (P, 2) the views of each pair.
     """
-    slopes = np.stack([residuals[1] - residuals[2], residuals[3] - residuals[4]], 1) / (2 * STEP)
-    sensible = np.abs(slopes).max(1) < 10
-    r, J, pair = residuals[0][sensible], slopes[sensible], pair[sensible]
+    slopes = np.stack([found[1] - found[2], found[3] - found[4]], 1) / (2 * STEP)
+    largest = np.abs(slopes).max(1)
+    sensible = (largest < LARGEST_SLOPE) & (largest > 1e-9)
+    r, J, pair = found[0][sensible], slopes[sensible], pair[sensible]
     if len(r) < LEAST_RESIDUALS or len(np.unique(views[np.unique(pair)])) < LEAST_VIEWS:
         return None
     shift = np.zeros(2)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.evidence import Evidence, Features, Points, gather_evidence
+from lsmgeo.diagnosis.evidence import Evidence, Features, Points, gather_evidence, is_rectified
 from lsmgeo.diagnosis.explain import explain
 from lsmgeo.diagnosis.facts import describe_scene, implausibilities
 from lsmgeo.diagnosis.findings import Cause, Check, Findings
@@ -61,21 +61,23 @@ def examine_photographs(scene: PosedImages) -> Examination:
     asis = as_they_are(scene)
     evidence = gather_evidence(scene, views, sizes, asis)
     checks = [check for item in evidence for check in item.measure_all(asis)]
+    tried: tuple[str, ...] = ()
     cause, remarks = None, implausibilities(asis.photographs, sizes)
-    if not all(check.passed for check in checks) or any(
-        badness(check) > SUSPICIOUS for check in checks if check.name != CENTRED
-    ):
+    passed = all(check.passed for check in checks)
+    if not passed or any(badness(check) > SUSPICIOUS for check in checks if check.name != CENTRED):
         explanation, tried = explain(asis, evidence, scene.names, sizes, views)
         cause = None if explanation is None else _told(explanation)
-        if cause is None and not all(check.passed for check in checks):
-            remarks.append(f"no single mistake explains this; tried were {', '.join(tried)}, half a pixel")
     if cause is None:
         checks, cause = _with_views(scene, checks, evidence, asis)
     if cause is None:
         shifts = find_shifts(evidence, asis.photographs)
         cause = _half_a_pixel(shifts)
-        if cause is None and checks and not any(is_certain(shift) for shift in shifts):
+        if cause is None and not passed:
+            remarks.append(f"no single mistake explains this; tried were {', '.join(tried)}, half a pixel")
+        elif cause is None and checks and not any(is_certain(shift) for shift in shifts):
             remarks.append("half a pixel more or less could not be seen in this data")
+    if checks and is_rectified(asis.photographs):
+        remarks.append("this pair is rectified: OpenGL axes or a flipped y would leave no trace")
     facts = describe_scene(scene, views, evidence, asis, sizes)
     findings = Findings(tuple(facts), tuple(checks), cause, tuple(remarks))
     return Examination(findings, tuple(evidence), asis, views)

@@ -1,0 +1,314 @@
+"""Mistakes planted in photographs of exactly known geometry are named, and right cameras are not accused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lsmgeo.diagnosis import evidence, examine
+from lsmgeo.diagnosis.matching import match_features
+from lsmgeo.diagnosis.photographs import examine_photographs
+from lsmgeo.errors import DataError
+from tests.diagnosis.textured import (
+    in_order,
+    matrices,
+    on_an_arc,
+    planted,
+    trace,
+    with_cameras,
+    with_depth,
+    with_points,
+    with_voxels,
+    write,
+)
+
+COMMON = ["poses inverted", "OpenGL axes", "y flipped", "K of another resolution", "frames shuffled"]
+RARE = [
+    "poses inverted and OpenGL axes",
+    "rotation transposed",
+    "centre taken as translation",
+    "translation negated",
+    "other camera axes",
+    "focal length off",
+]
+
+
+@pytest.fixture(scope="session")
+def room():
+    return trace(*on_an_arc(7))
+
+
+@pytest.fixture(autouse=True)
+def same_matches(request, monkeypatch):
+    """Mistakes in cameras leave the photographs alone: each set of them is matched once."""
+    monkeypatch.setattr(evidence, "match_features", request.getfixturevalue("matches_by_paths"))
+
+
+@pytest.fixture(scope="session")
+def matches_by_paths():
+    known = {}
+
+    def match(scene, views):
+        key = tuple(scene.paths)
+        if key not in known:
+            known[key] = match_features(scene, views)
+        return known[key]
+
+    return match
+
+
+@pytest.fixture(scope="session")
+def photographs(room, tmp_path_factory):
+    """Nothing but textured photographs."""
+    return write(room, tmp_path_factory.mktemp("room"))
+
+
+@pytest.fixture(scope="session")
+def blank(room, tmp_path_factory):
+    """The same cameras, and photographs in which no feature is found."""
+    return write(replace(room, images=np.full_like(room.images, 128)), tmp_path_factory.mktemp("blank"))
+
+
+@pytest.fixture(scope="session")
+def cut_out(tmp_path_factory):
+    """Photographs all around without texture, cut out."""
+    angles = [0.0, 0.9, 2.1, 3.3, 4.1, 5.2]
+    heights = [0.3, -0.9, 1.1, -0.2, 0.8, -1.3]
+    eyes = [(2.6 * np.sin(a), h, -2.6 * np.cos(a)) for a, h in zip(angles, heights, strict=True)]
+    traced = trace(eyes, [0.0, 0.4, -0.3, 0.8, 0.1, -0.6], texture=False, focal=300.0)
+    return write(traced, tmp_path_factory.mktemp("cut_out"), cut_out=True)
+
+
+def check(findings, name):
+    return next(check for check in findings.checks if name in check.name)
+
+
+def test_right_cameras_are_good(photographs):
+    findings = examine(photographs, photographs.paths[0].parent)
+    assert findings.verdict == "good"
+    assert findings.cause is None
+    assert check(findings, "epipolar").value < 0.2
+    assert check(findings, "epipolar").measured > 300
+    assert check(findings, "in front").value == 100
+    assert check(findings, "agree with the others").value == 100
+
+
+@pytest.mark.parametrize("mistake", [*COMMON, *RARE])
+def test_a_mistake_is_told_from_features_alone(photographs, mistake):
+    findings = examine_photographs(planted(photographs, mistake)).findings
+    assert findings.verdict == "bad"
+    assert findings.cause is not None
+    assert findings.cause.name == mistake
+
+
+@pytest.mark.parametrize("shift", [0.5, -0.5])
+def test_half_a_pixel_is_found_though_all_checks_pass(photographs, shift):
+    K, _ = matrices(photographs)
+    K[:, :2, 2] += shift
+    findings = examine_photographs(with_cameras(photographs, K=K)).findings
+    assert all(check.passed for check in findings.checks)
+    assert findings.cause is not None
+    assert findings.cause.name == "half a pixel"
+    assert ("subtract 0.5" if shift > 0 else "add 0.5") in findings.cause.remedy
+
+
+def test_a_smaller_shift_is_no_half_pixel(photographs):
+    K, _ = matrices(photographs)
+    K[:, :2, 2] += 0.12
+    assert examine_photographs(with_cameras(photographs, K=K)).findings.verdict == "good"
+
+
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        ([6, 5, 4, 3, 2, 1, 0], "the order reversed"),
+        ([1, 2, 3, 4, 5, 6, 0], "1 place later"),
+        ([0, 1, 4, 3, 2, 5, 6], "frame_2.png to the camera of frame_4.png"),
+    ],
+)
+def test_orders_are_named(photographs, order, words):
+    cause = examine_photographs(in_order(photographs, order)).findings.cause
+    assert cause.name == "frames shuffled"
+    assert words in cause.remedy
+
+
+def test_one_view_that_is_off_is_named(photographs):
+    _, E = matrices(photographs)
+    angle = np.radians(4.0)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    E[3, :3] = turn @ E[3, :3]
+    findings = examine_photographs(with_cameras(photographs, E=E)).findings
+    assert findings.verdict == "bad"
+    assert findings.cause.name == "some views are off"
+    assert "frame_3.png" in findings.cause.evidence
+    assert "frame_2.png" not in findings.cause.evidence
+
+
+def test_what_no_mistake_explains_is_said(photographs):
+    _, E = matrices(photographs)
+    rng = np.random.default_rng(1)
+    for pose in E:
+        turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+        pose[:3, :3] = turn * np.sign(np.linalg.det(turn))
+    findings = examine_photographs(with_cameras(photographs, E=E)).findings
+    assert findings.verdict == "bad"
+    assert findings.cause is None
+    assert "no single mistake explains this" in " ".join(findings.remarks)
+    assert all(name in " ".join(findings.remarks) for name in COMMON)
+
+
+def test_moving_and_scaling_the_world_changes_nothing(room, photographs):
+    scene = with_points(photographs, room)
+    _, E = matrices(scene)
+    turn, _ = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))
+    turn *= np.sign(np.linalg.det(turn))
+    shift, scale = np.array([3.0, -1.0, 0.5]), 7.5
+    # X' = scale turn X + shift, and cameras that see X' as the old ones saw X.
+    R = E[:, :3, :3] @ turn.T
+    t = scale * E[:, :3, 3] - R @ shift
+    moved_E = E.copy()
+    moved_E[:, :3, :3], moved_E[:, :3, 3] = R, t
+    moved = with_cameras(scene, E=moved_E)
+    points = scene.points._replace(positions=scale * scene.points.positions @ turn.T + shift)
+    before = examine_photographs(scene).findings
+    after = examine_photographs(replace(moved, points=points)).findings
+    assert after.verdict == before.verdict == "good"
+    np.testing.assert_allclose([c.value for c in after.checks], [c.value for c in before.checks], rtol=1e-6)
+
+
+@pytest.mark.parametrize("mistake", [*COMMON, "rotation transposed", "centre taken as translation", "half a pixel"])
+def test_a_mistake_is_told_from_points_alone(room, blank, mistake):
+    scene = with_points(blank, room)
+    assert examine_photographs(scene).findings.verdict == "good"
+    wrong = planted(scene, mistake)
+    if mistake == "frames shuffled":
+        order = np.random.default_rng(3).permutation(len(scene))
+        K, E = matrices(scene)
+        wrong = with_cameras(scene, K=K[order], E=E[order])
+    cause = examine_photographs(wrong).findings.cause
+    assert cause is not None
+    assert cause.name == mistake
+
+
+def test_reprojection_error_is_that_of_the_noise(room, blank):
+    findings = examine_photographs(with_points(blank, room, noise_px=0.3)).findings
+    # The median length of a vector of two normal errors.
+    np.testing.assert_allclose(check(findings, "reprojection").value, 0.3 * np.sqrt(2 * np.log(2)), rtol=0.1)
+
+
+@pytest.mark.parametrize("mistake", ["poses inverted", "OpenGL axes", "y flipped", "K of another resolution"])
+def test_a_mistake_is_told_from_depth_alone(room, blank, mistake):
+    scene = with_depth(blank, room)
+    good = examine_photographs(scene).findings
+    assert good.verdict == "good"
+    assert check(good, "depth of one view").value < 0.5
+    cause = examine_photographs(planted(scene, mistake)).findings.cause
+    assert cause is not None
+    assert cause.name == mistake
+
+
+def test_depth_in_millimetres_and_along_the_ray_are_named(room, blank):
+    findings = examine_photographs(with_depth(blank, room, 1000 * room.depth)).findings
+    assert findings.cause.name == "depth in other units"
+    assert "0.001" in findings.cause.remedy
+    v, u = np.mgrid[:240, :320]
+    rays = np.stack([u, v, np.ones_like(u)], -1)[None] @ np.linalg.inv(room.K)[:, None].transpose(0, 1, 3, 2)
+    findings = examine_photographs(with_depth(blank, room, room.depth * np.linalg.norm(rays, axis=-1))).findings
+    assert findings.cause is not None
+    assert findings.cause.name == "depth along the ray"
+
+
+@pytest.mark.parametrize("mistake", COMMON)
+@pytest.mark.parametrize("solid", [False, True])
+def test_a_mistake_is_told_from_outlines_alone(cut_out, solid, mistake):
+    scene = with_voxels(cut_out) if solid else cut_out
+    good = examine_photographs(scene).findings
+    assert good.verdict == "good"
+    if solid:
+        assert check(good, "inside the outlines").value > 99
+        assert check(good, "overlap").value > 80
+    cause = examine_photographs(planted(scene, mistake)).findings.cause
+    assert cause is not None
+    assert cause.name == mistake
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.5])
+def test_half_a_pixel_is_told_from_outlines(cut_out, shift):
+    K, _ = matrices(cut_out)
+    K[:, :2, 2] += shift
+    cause = examine_photographs(with_cameras(cut_out, K=K)).findings.cause
+    assert (cause and cause.name) == ("half a pixel" if shift else None)
+
+
+def test_cameras_in_one_place_are_compared_by_their_rotations(tmp_path):
+    rolls = [0.0, 0.25, 0.5, 0.8]
+    traced = trace([(0.3, 0.2, -2.2)] * 4, rolls)
+    scene = write(traced, tmp_path)
+    findings = examine_photographs(scene).findings
+    assert findings.verdict == "good"
+    assert check(findings, "epipolar").value < 0.2
+    assert "all cameras are in one place" in " ".join(findings.remarks)
+    assert examine_photographs(planted(scene, "rotation transposed")).findings.verdict == "bad"
+
+
+def test_views_of_different_sizes(room, photographs, tmp_path):
+    from PIL import Image
+
+    large = tmp_path / "large.png"
+    with Image.open(photographs.paths[2]) as picture:
+        picture.resize((960, 720), Image.Resampling.BICUBIC).save(large)
+    K, _ = matrices(photographs)
+    K[2, :2, 2] = 3 * (K[2, :2, 2] + 0.5) - 0.5
+    K[2, [0, 1], [0, 1]] *= 3
+    scene = replace(with_cameras(photographs, K=K), paths=(*photographs.paths[:2], large, *photographs.paths[3:]))
+    height, width = (value.clone() for value in scene.cameras[2:])
+    height[2], width[2] = 720, 960
+    scene = replace(scene, cameras=scene.cameras._replace(height=height, width=width))
+    findings = examine_photographs(scene).findings
+    assert findings.verdict == "good"
+    assert "2 sizes from 320 x 240 to 960 x 720" in dict(findings.facts)["photographs"]
+
+
+def test_nothing_to_measure_is_no_verdict(blank):
+    assert examine_photographs(blank).findings.verdict == "unknown"
+    alone = replace(
+        blank,
+        names=blank.names[:1],
+        paths=blank.paths[:1],
+        cameras=type(blank.cameras)(*(torch.as_tensor(value)[:1] for value in blank.cameras)),
+    )
+    findings = examine_photographs(alone).findings
+    assert findings.verdict == "unknown"
+    assert findings.checks == ()
+
+
+def test_a_damaged_photograph_is_a_data_error(photographs, tmp_path):
+    bad = tmp_path / "bad.png"
+    bad.write_bytes(photographs.paths[0].read_bytes()[:2000])
+    scene = replace(photographs, paths=(bad, *photographs.paths[1:]))
+    with pytest.raises(DataError, match=r"bad\.png"):
+        examine_photographs(scene)
+
+
+def test_of_many_photographs_some_are_looked_at(photographs, monkeypatch):
+    count = 90
+    rows = np.arange(count) % 7
+    scene = replace(
+        photographs,
+        names=tuple(f"{index}.png" for index in range(count)),
+        paths=tuple(photographs.paths[row] for row in rows),
+        cameras=type(photographs.cameras)(*(torch.as_tensor(value)[rows] for value in photographs.cameras)),
+    )
+    looked_at = []
+
+    def no_matches(scene, views):
+        looked_at.extend(views)
+        return match_features(scene, views[:0])
+
+    monkeypatch.setattr(evidence, "match_features", no_matches)
+    findings = examine_photographs(scene).findings
+    assert len(looked_at) == 40
+    assert looked_at[:4] == [0, 1, 2, 3]
+    assert looked_at[-4:] == [86, 87, 88, 89]
+    assert dict(findings.facts)["looked at"].startswith("40 of them")

@@ -50,7 +50,7 @@ class DepthPng(DepthFile):
 
     def read(self, size: tuple[int, int]) -> np.ndarray:
         """(H, W) float32 camera z, 0 where there is none."""
-        steps = decode_png(read_bytes(self.path, 4096 + 4 * MAX_PIXELS), size, DEPTH, self.path)
+        steps = decode_png(read_bytes(self.path, 4096 + 4 * MAX_PIXELS), size, DEPTH, self.path, extras=True)
         depth = np.where(np.isin(steps, self.empty), 0.0, steps * self.step).astype(np.float32)
         if not np.isfinite(depth).all():
             raise DataError(self.path, f"has depth beyond what float32 holds at a step of {self.step:g}")

@@ -68,8 +68,12 @@ def encode_png(pixels: np.ndarray) -> bytes:
     filtered[:, 0] = UP
     filtered[0, 1:] = rows[0]
     np.subtract(rows[1:], rows[:-1], out=filtered[1:, 1:])
-    header = struct.pack(">IIBBBBB", width, height, kind.bit_depth, kind.colour_type, 0, 0, 0)
-    data = zlib.compress(filtered.tobytes(), LEVEL)
+    return _contain(zlib.compress(filtered.tobytes(), LEVEL), (height, width), kind)
+
+
+def _contain(data: bytes, size: tuple[int, int], kind: PngKind) -> bytes:
+    """The file that holds these compressed pixels and nothing else."""
+    header = struct.pack(">IIBBBBB", size[1], size[0], kind.bit_depth, kind.colour_type, 0, 0, 0)
     return SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", data) + _chunk(b"IEND", b"")
 
 
@@ -78,7 +82,13 @@ def _chunk(name: bytes, content: bytes) -> bytes:
 
 
 def decode_png(
-    content: bytes, size: tuple[int, int], kind: PngKind, path: str | PathLike[str], member: str = ""
+    content: bytes,
+    size: tuple[int, int],
+    kind: PngKind,
+    path: str | PathLike[str],
+    member: str = "",
+    *,
+    extras: bool = False,
 ) -> np.ndarray:
     """Read a PNG of known size and kind.
 
@@ -88,6 +98,7 @@ def decode_png(
         kind: `RGBA` or `DEPTH`.
         path: the file that holds it, for errors.
         member: its name in that file, for errors.
+        extras: step over what PNG calls ancillary, such as resolution, gamma and comments, instead of refusing it.
 
     Returns:
         (H, W, 4) uint8, its memory perhaps in planes, or (H, W) uint16.
@@ -97,7 +108,7 @@ def decode_png(
             needs.
     """
     where = f"{member}: " if member else ""
-    data = _image_data(content, size, kind, path, where)
+    data = _image_data(content, size, kind, path, where, extras=extras)
     height, width = size
     stride = 1 + width * kind.channels * kind.dtype.itemsize
     inflate = zlib.decompressobj()
@@ -112,7 +123,7 @@ def decode_png(
     if not (filters <= 4).all():
         raise DataError(path, f"{where}is a damaged picture (an unknown filter)")
     if not (filters == UP).all():
-        return _by_opencv(content, size, kind, path, where)
+        return _by_opencv(_contain(data, size, kind), size, kind, path, where)
     if kind is RGBA:
         # Into planes, which is where all readers want the colours; it takes no longer.
         planes = np.empty((4, height, width), np.uint8)
@@ -123,7 +134,9 @@ def decode_png(
     return pixels.view(">u2").astype(np.uint16)
 
 
-def _image_data(content: bytes, size: tuple[int, int], kind: PngKind, path: str | PathLike[str], where: str) -> bytes:
+def _image_data(
+    content: bytes, size: tuple[int, int], kind: PngKind, path: str | PathLike[str], where: str, *, extras: bool
+) -> bytes:
     """The compressed pixels of a PNG whose container has been checked."""
     if not content.startswith(SIGNATURE):
         raise DataError(path, f"{where}is not a PNG picture")
@@ -137,8 +150,10 @@ def _image_data(content: bytes, size: tuple[int, int], kind: PngKind, path: str 
         chunk = content[offset + 8 : offset + 8 + length]
         if struct.unpack_from(">I", content, offset + 8 + length)[0] != zlib.crc32(chunk, zlib.crc32(name)):
             raise DataError(path, f"{where}is a damaged picture (a wrong check sum)")
-        # Anything else could change what the pixels mean (palettes, transparency, animation).
-        if name not in (b"IDAT", b"IEND") if last else name != b"IHDR":
+        # Anything else could change what the pixels mean (palettes, transparency, animation), but for a small first
+        # letter, by which PNG marks what may be stepped over.
+        ancillary = extras and name[:1].islower()
+        if not ancillary and name not in (b"IDAT", b"IEND") if last else name != b"IHDR":
             raise DataError(path, f"{where}holds a PNG chunk {name!r}; expected IHDR, IDAT and IEND alone")
         if name == b"IHDR":
             header = chunk

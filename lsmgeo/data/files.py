@@ -7,18 +7,19 @@ allocated, names stay inside their folder, and every failure is a :class:`lsmgeo
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import tempfile
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO, ParamSpec, TypeVar
 
 import numpy as np
 
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from PIL import Image
 
@@ -35,6 +36,7 @@ __all__ = [
     "read_cut_out",
     "read_image",
     "read_text",
+    "refuse_unreadable",
     "write_atomic",
     "write_point_cloud",
 ]
@@ -43,6 +45,26 @@ __all__ = [
 MAX_PIXELS = 1 << 26
 MAX_TEXT_BYTES = 1 << 28
 MAX_NUMBER_LENGTH = 64
+
+
+Options = ParamSpec("Options")
+Content = TypeVar("Content")
+
+
+def refuse_unreadable(read: Callable[Options, Content]) -> Callable[Options, Content]:
+    """Make what the system says while a reader looks around (no permission, a name too long) a `DataError`."""
+
+    @functools.wraps(read)
+    def refusing(*args: Options.args, **options: Options.kwargs) -> Content:
+        try:
+            return read(*args, **options)
+        except DataError:
+            raise
+        except OSError as error:
+            path = args[0] if args else options["path"]
+            raise DataError(str(path), f"cannot be read ({str(error)[:400]})") from error
+
+    return refusing
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
@@ -73,7 +95,8 @@ def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:
         DataError: as :func:`read_bytes`, or the content is not UTF-8 text.
     """
     try:
-        text = read_bytes(path, limit).decode("utf-8")
+        # Windows puts a mark of byte order before its UTF-8.
+        text = read_bytes(path, limit).decode("utf-8").removeprefix("\ufeff")
     except UnicodeDecodeError as error:
         raise DataError(path, "is not a text file (invalid UTF-8)") from error
     if "\0" in text:
@@ -161,6 +184,9 @@ def has_alpha(path: Path) -> bool:
 def read_image(path: Path, size: tuple[int, int] | None = None, max_pixels: int = MAX_PIXELS) -> np.ndarray:
     """Read a PNG or JPEG photograph as 8-bit RGB.
 
+    The pixels come as they are stored: an orientation that EXIF states is not applied, as COLMAP and instant-ngp do not
+    apply it.
+
     Args:
         path: the image file.
         size: expected (height, width); checked before a pixel is decoded.
@@ -214,7 +240,9 @@ def _open_image(path: Path, max_pixels: int) -> Iterator[Image.Image]:
         if path.stat().st_size > limit:
             raise DataError(path, f"is larger than the limit of {limit} bytes")
         with warnings.catch_warnings():
-            warnings.simplefilter("error")
+            # Pillow warns of palettes and of second pictures in a JPEG, which are read as they should be.
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
             # Sniffing among all of Pillow's formats would reach parsers (EPS, FITS) that run programs or expand files.
             # The file itself, not its bytes: of hundreds of photographs only the headers are read when a scene opens.
             with path.open("rb") as stream, Image.open(stream, formats=("PNG", "JPEG")) as image:

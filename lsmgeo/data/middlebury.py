@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from lsmgeo.cameras import from_opencv
-from lsmgeo.data.files import child, image_size, parse_floats, parse_ints, read_text
-from lsmgeo.data.posed import PosedImages
-from lsmgeo.errors import DataError, LsmGeoError
+from lsmgeo.data.assembling import as_data_error, assemble, check_intrinsics, check_rotation
+from lsmgeo.data.files import child, image_size, parse_floats, parse_ints, read_text, refuse_unreadable
+from lsmgeo.errors import DataError
+
+if TYPE_CHECKING:
+    from lsmgeo.data.posed import PosedImages
 
 __all__ = ["parameter_files", "read_middlebury"]
 
@@ -22,6 +26,7 @@ def parameter_files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.glob("*_par.txt") if path.is_file())
 
 
+@refuse_unreadable
 def read_middlebury(path: str | Path) -> PosedImages:
     """Read a Middlebury multi-view scene.
 
@@ -61,31 +66,14 @@ def read_middlebury(path: str | Path) -> PosedImages:
         if len(tokens) != 22:
             raise DataError(file, f"{where}: expected a name and 21 numbers; got {len(tokens)} items")
         numbers[view] = parse_floats(tokens[1:], file, where)
-        _check_camera(numbers[view, :9].reshape(3, 3), numbers[view, 9:18].reshape(3, 3), file, where)
+        check_intrinsics(numbers[view, :9].reshape(3, 3), file, where)
+        check_rotation(numbers[view, 9:18].reshape(3, 3), file, where)
         names.append(tokens[0])
         paths.append(child(file.parent, tokens[0], file))
         # The format does not state the size, so it comes from the picture's own header.
         sizes.append(image_size(paths[-1]))
-    if len(set(names)) != count:
-        raise DataError(file, "names a photograph twice")
     height, width = torch.tensor(sizes).unbind(-1)
     K, R, t = torch.from_numpy(numbers).split((9, 9, 3), -1)
-    try:
+    with as_data_error(file):
         cameras = from_opencv(K.reshape(-1, 3, 3), R.reshape(-1, 3, 3), t, height, width)
-    except LsmGeoError as error:
-        raise DataError(file, str(error)) from error
-    return PosedImages(tuple(names), tuple(paths), cameras, None, "middlebury")
-
-
-def _check_camera(intrinsics: np.ndarray, rotation: np.ndarray, file: Path, where: str) -> None:
-    lower = intrinsics[[1, 2, 2], [0, 0, 1]]
-    if np.abs(lower).max() > 1e-9 or abs(intrinsics[2, 2] - 1) > 1e-9 or min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
-        raise DataError(file, f"{where}: K must be upper triangular with positive focal lengths and last row 0 0 1")
-    if np.abs(intrinsics).max() > 1e7:
-        raise DataError(file, f"{where}: K holds a number beyond 1e7 pixels")
-    if (
-        np.abs(rotation).max() > 2
-        or np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3
-        or np.linalg.det(rotation) < 0
-    ):
-        raise DataError(file, f"{where}: R is not a rotation")
+    return assemble(names, paths, cameras, "middlebury", file=file)

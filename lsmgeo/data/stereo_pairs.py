@@ -13,7 +13,7 @@ import torch
 from lsmgeo.cameras import from_opencv
 from lsmgeo.data.assembling import as_data_error, assemble, check_intrinsics, check_picture
 from lsmgeo.data.depth_files import DepthFile
-from lsmgeo.data.files import child, image_size, parse_floats, parse_ints, read_text
+from lsmgeo.data.files import child, image_size, parse_floats, parse_ints, read_text, refuse_unreadable
 from lsmgeo.data.pfm import read_pfm
 from lsmgeo.errors import DataError
 
@@ -26,7 +26,7 @@ MAX_CALIBRATION_BYTES = 1 << 16
 MOST = 1e7
 # The file rounds to three decimals.
 ROUNDING = 0.01
-ENTRY = re.compile(r"\s*(\w{1,32})\s*=\s*(.*?)\s*")
+NAME = re.compile(r"\w{1,32}")
 MATRIX = re.compile(r"\[([^;\[\]]*);([^;\[\]]*);([^;\[\]]*)\]")
 # The second is the name in version 3 of the benchmark.
 DISPARITIES = (("disp0.pfm", "disp0GT.pfm"), ("disp1.pfm", "disp1GT.pfm"))
@@ -65,6 +65,7 @@ def is_stereo_pair(path: Path) -> bool:
     return (path / "calib.txt").is_file() and (path / "im0.png").is_file()
 
 
+@refuse_unreadable
 def read_stereo_pair(path: str | Path) -> PosedImages:
     """Read a stereo pair of the Middlebury sets of 2014 and 2021.
 
@@ -128,12 +129,12 @@ def _entries(file: Path) -> dict[str, str]:
     for number, line in enumerate(read_text(file, MAX_CALIBRATION_BYTES).splitlines(), 1):
         if not line.strip():
             continue
-        match = ENTRY.fullmatch(line)
-        if match is None:
+        name, equals, value = (part.strip() for part in line.partition("="))
+        if not equals or NAME.fullmatch(name) is None:
             raise DataError(file, f"line {number}: expected name=value")
-        if match[1] in entries:
-            raise DataError(file, f"line {number}: states {match[1]} twice")
-        entries[match[1]] = match[2]
+        if name in entries:
+            raise DataError(file, f"line {number}: states {name} twice")
+        entries[name] = value
     return entries
 
 

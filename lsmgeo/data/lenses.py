@@ -14,6 +14,8 @@ __all__ = ["Lens"]
 
 # What a camera sees may shrink or grow by so much when it is straightened; beyond, the coefficients are nonsense.
 MOST_ZOOM = 20.0
+# OpenCV's remap counts pixels along a side in 16 bits.
+MAX_SIDE = (1 << 15) - 2
 # Points along each side of a photograph at which its view is measured, and pixels by which these may miss.
 RIM_STEPS = 65
 RIM_SLACK = 0.01
@@ -48,8 +50,12 @@ class Lens:
         """K of the straightened photograph, (3, 3): as wide a view as has no empty pixel, at the same size.
 
         Raises:
-            CameraError: the coefficients straighten nothing: no such view exists.
+            CameraError: the coefficients straighten nothing: no such view exists; or the photograph is too long for
+                OpenCV.
         """
+        if max(self.height, self.width) > MAX_SIDE:
+            size = f"{self.width} x {self.height}"
+            raise CameraError(f"Lens: photographs of at most {MAX_SIDE} pixels a side are straightened; got {size}")
         rims = [self._rays(rim) for rim in self._rims()]
         # A ray that the model cannot trace back (NaN) may lie in a corner that the view need not reach.
         if any(np.isnan(rim[:, 0]).all() for rim in rims):

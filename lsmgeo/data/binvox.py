@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from lsmgeo._checks import check_choice
-from lsmgeo.data.files import parse_floats, parse_ints, read_bytes
+from lsmgeo.data.files import parse_floats, parse_ints, read_bytes, refuse_unreadable
 from lsmgeo.data.posed import Voxels
 from lsmgeo.errors import DataError, LsmGeoError
 from lsmgeo.grids import VoxelGrid
@@ -41,6 +41,7 @@ def is_binvox(path: Path) -> bool:
         return stream.read(len(SIGNATURE)) == SIGNATURE
 
 
+@refuse_unreadable
 def read_binvox(path: str | Path, *, placement: str = "header") -> Voxels:
     """Read a binvox file.
 

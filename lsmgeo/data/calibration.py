@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypeVar
 import numpy as np
 
 from lsmgeo.data.assembling import MAX_SIDE, check_intrinsics, check_rotation
-from lsmgeo.data.files import child
+from lsmgeo.data.files import child, refuse_unreadable
 from lsmgeo.data.lenses import Lens
 from lsmgeo.data.storage import Entries, is_storage, read_storages
 from lsmgeo.errors import DataError
@@ -106,6 +106,7 @@ def is_calibration(path: Path) -> bool:
     return bool(calibration_files(path)) if path.is_dir() else is_storage(path)
 
 
+@refuse_unreadable
 def read_calibration(path: str | Path) -> Calibration:
     """Read calibrations that OpenCV's FileStorage wrote as YAML, XML or JSON.
 
@@ -137,10 +138,7 @@ def read_calibration(path: str | Path) -> Calibration:
         >>> calibration = data.read_calibration("intrinsics.yml")  # doctest: +SKIP
     """
     path = Path(path)
-    try:
-        files = calibration_files(path) if path.is_dir() else [path]
-    except OSError as error:
-        raise DataError(path, f"cannot be read ({error})") from error
+    files = calibration_files(path) if path.is_dir() else [path]
     if not 0 < len(files) <= MOST_FILES:
         raise DataError(path, f"expected 1 to {MOST_FILES} calibration files (YAML, XML or JSON); found {len(files)}")
     lenses: dict[str, CalibratedLens] = {}

@@ -11,7 +11,7 @@ import torch
 from lsmgeo._checks import describe
 from lsmgeo.cameras import from_opencv
 from lsmgeo.data.assembling import as_data_error, assemble, check_intrinsics, check_picture, check_rotation
-from lsmgeo.data.files import child, has_alpha, image_size
+from lsmgeo.data.files import child, has_alpha, image_size, refuse_unreadable
 from lsmgeo.data.json_files import peek_json, read_json, take_array, take_number, take_text
 from lsmgeo.data.posed import PosedImages
 from lsmgeo.errors import DataError
@@ -37,6 +37,7 @@ def is_cameras_json(path: Path) -> bool:
     )
 
 
+@refuse_unreadable
 def read_cameras_json(path: str | Path) -> PosedImages:
     """Read cameras from a plain JSON file.
 

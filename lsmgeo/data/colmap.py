@@ -11,7 +11,7 @@ import torch
 from lsmgeo.cameras import from_colmap
 from lsmgeo.data import colmap_binary, colmap_text
 from lsmgeo.data.assembling import as_data_error, assemble
-from lsmgeo.data.files import child
+from lsmgeo.data.files import child, refuse_unreadable
 from lsmgeo.data.posed import Observations, PosedImages, SparsePoints
 from lsmgeo.errors import DataError
 
@@ -24,19 +24,21 @@ __all__ = ["model_folder", "read_colmap"]
 
 def model_folder(path: Path) -> tuple[Path, str] | None:
     """Where a COLMAP model lies in or below ``path``, and its form ("bin" or "txt"); None where there is none."""
-    for folder in (path, path / "sparse", path / "sparse" / "0"):
+    for folder in (path, path / "sparse", path / "sparse" / "0", path / "0"):
         for form in ("bin", "txt"):
             if (folder / f"cameras.{form}").is_file() and (folder / f"images.{form}").is_file():
                 return folder, form
     return None
 
 
+@refuse_unreadable
 def read_colmap(path: str | Path, images: str | Path | None = None) -> PosedImages:
     """Read a COLMAP model; photographs with distortion are straightened.
 
     The model (``cameras``, ``images`` and, where it exists, ``points3D``, binary or text) is looked for in the folder,
-    in ``sparse`` and in ``sparse/0``; the photographs in ``images`` beside it, else in the folder itself. Photographs
-    are ordered by name. Its files of rigs and frames repeat the photographs' poses and are not read.
+    in ``sparse``, ``sparse/0`` and ``0``; the photographs in ``images`` in it or in up to three folders above, else in
+    the folder itself. Photographs are ordered by name. Its files of rigs and frames repeat the photographs' poses and
+    are not read.
 
     Convention:
         COLMAP's poses are world-to-camera with OpenCV axes, as ours. Its pixel centres are half-integer: principal
@@ -71,7 +73,7 @@ def read_colmap(path: str | Path, images: str | Path | None = None) -> PosedImag
     for entry in entries:
         camera = model.cameras.get(entry.camera_id)
         if camera is None:
-            raise DataError(file, f"{entry.name!r} refers to camera {entry.camera_id}, which does not exist")
+            raise DataError(file, f"{entry.name[:80]!r} refers to camera {entry.camera_id}, which does not exist")
         paths.append(child(root, entry.name, file))
         used.append(camera)
     with as_data_error(file):
@@ -95,9 +97,10 @@ def read_colmap(path: str | Path, images: str | Path | None = None) -> PosedImag
 
 
 def _image_folder(path: Path, model: Path) -> Path:
-    for folder in (path / "images", model / "images", model.parent / "images", model.parent.parent / "images"):
-        if folder.is_dir():
-            return folder
+    # The third is where nerfstudio keeps them, whose models are in colmap/sparse/0.
+    for folder in (path, model, *model.absolute().parents[:3]):
+        if (folder / "images").is_dir():
+            return folder / "images"
     return path
 
 

@@ -9,7 +9,7 @@ import torch
 
 from lsmgeo.cameras import from_opencv
 from lsmgeo.data.assembling import MAX_PARAMETER, MAX_SIDE, as_data_error, assemble, check_rotation
-from lsmgeo.data.files import child, has_alpha, image_size
+from lsmgeo.data.files import child, has_alpha, image_size, refuse_unreadable
 from lsmgeo.data.npy import read_npy
 from lsmgeo.data.posed import PosedImages
 from lsmgeo.errors import DataError
@@ -37,6 +37,7 @@ def is_llff(path: Path) -> bool:
         return False
 
 
+@refuse_unreadable
 def read_llff(path: str | Path) -> PosedImages:
     """Read a scene of LLFF, which NeRF's forward-facing and mip-NeRF 360's photographs share.
 
@@ -104,10 +105,9 @@ def _pictures(file: Path) -> list[Path]:
     for name in ("images", *REDUCED):
         folder = file.parent / name
         if folder.is_dir():
-            try:
-                found = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
-            except OSError as error:
-                raise DataError(folder, f"cannot be read ({error})") from error
+            # A name with a dot in front is no photograph: macOS leaves such files beside each of them.
+            seen = (path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+            found = sorted(name for name in seen if not name.startswith("."))
             return [child(file.parent, f"{name}/{picture}", file) for picture in found]
     return []
 

@@ -13,7 +13,7 @@ from lsmgeo._checks import check_choice
 from lsmgeo.cameras import from_opencv
 from lsmgeo.data.assembling import as_data_error, check_intrinsics, check_rotation
 from lsmgeo.data.depth_files import DepthPng
-from lsmgeo.data.files import child, image_size
+from lsmgeo.data.files import child, image_size, refuse_unreadable
 from lsmgeo.data.mat_files import read_mats
 from lsmgeo.data.metadata import MAX_VIEWS
 from lsmgeo.data.posed import PosedImages, Voxels
@@ -56,6 +56,7 @@ def is_lsm(path: Path) -> bool:
     return renders and cameras
 
 
+@refuse_unreadable
 def read_lsm(path: str | Path, *, voxels: int = 32) -> PosedImages:
     """Read one object of the LSM release: ``renders/SYNSET/MODEL``, its voxels beside ``renders``.
 

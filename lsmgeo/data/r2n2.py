@@ -10,7 +10,7 @@ import torch
 from lsmgeo.cameras import from_opencv
 from lsmgeo.data.assembling import as_data_error
 from lsmgeo.data.binvox import read_binvox
-from lsmgeo.data.files import child, image_size, parse_floats, read_text
+from lsmgeo.data.files import child, image_size, parse_floats, read_text, refuse_unreadable
 from lsmgeo.data.lsm_release import spell_synset
 from lsmgeo.data.metadata import MAX_VIEWS
 from lsmgeo.data.posed import PosedImages
@@ -33,6 +33,7 @@ def is_r2n2(path: Path) -> bool:
     return any((folder / METADATA).is_file() for folder in (path, path / "rendering"))
 
 
+@refuse_unreadable
 def read_r2n2(path: str | Path) -> PosedImages:
     """Read the renderings of one object as 3D-R2N2 published them.
 

@@ -11,7 +11,7 @@ import torch
 from lsmgeo.cameras import from_opencv
 from lsmgeo.data.assembling import as_data_error, assemble, check_intrinsics, check_rotation
 from lsmgeo.data.depth_files import DepthPng
-from lsmgeo.data.files import MAX_NUMBER_LENGTH, child, image_size, parse_floats, read_text
+from lsmgeo.data.files import MAX_NUMBER_LENGTH, child, image_size, parse_floats, read_text, refuse_unreadable
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ def is_rgbd(path: Path) -> bool:
     return all((path / name).is_file() for name in TABLES)
 
 
+@refuse_unreadable
 def read_rgbd(path: str | Path) -> PosedImages:
     """Read an RGB-D folder with one table of poses, as HoloLens recordings are kept.
 

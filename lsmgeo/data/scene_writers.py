@@ -123,7 +123,8 @@ def write_cameras_json(images: PosedImages, path: str | PathLike[str]) -> Path:
     Args:
         images: the photographs.
         path: a folder to make, which must not exist or be empty, for ``cameras.json`` and ``images``; or a file that
-            ends in ``.json``, in a folder that has all the photographs in or below it, for the cameras alone.
+            ends in ``.json``, in a folder that has all the photographs in or below it, for the cameras alone, where it
+            replaces one that is there.
 
     Returns:
         The path.

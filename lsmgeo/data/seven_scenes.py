@@ -10,7 +10,7 @@ import numpy as np
 from lsmgeo._checks import describe
 from lsmgeo.data.assembling import MAX_PARAMETER
 from lsmgeo.data.depth_files import DepthPng
-from lsmgeo.data.files import child, read_text
+from lsmgeo.data.files import child, read_text, refuse_unreadable
 from lsmgeo.data.rgbd import MILLIMETRE, frames_of, parse_pose
 from lsmgeo.errors import DataError, OptionError
 
@@ -34,6 +34,7 @@ def is_seven_scenes(path: Path) -> bool:
     return path.is_dir() and next(path.glob(POSES), None) is not None
 
 
+@refuse_unreadable
 def read_seven_scenes(path: str | Path, *, intrinsics: tuple[float, float, float, float] = KINECT) -> PosedImages:
     """Read one sequence of 7-Scenes, or of a set kept in its form.
 
@@ -69,10 +70,7 @@ def read_seven_scenes(path: str | Path, *, intrinsics: tuple[float, float, float
     """
     K = _matrix(intrinsics)
     folder = Path(path)
-    try:
-        files = sorted(folder.glob(POSES)) if folder.is_dir() else []
-    except OSError as error:
-        raise DataError(folder, f"cannot be read ({error})") from error
+    files = sorted(folder.glob(POSES)) if folder.is_dir() else []
     if not 0 < len(files) <= MAX_FRAMES:
         raise DataError(folder, f"expected 1 to {MAX_FRAMES} files {POSES}; found {len(files)}")
     names, poses, paths, depths = [], [], [], []

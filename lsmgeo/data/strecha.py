@@ -9,7 +9,7 @@ import torch
 
 from lsmgeo.cameras import from_opencv
 from lsmgeo.data.assembling import as_data_error, assemble, check_intrinsics, check_picture, check_rotation
-from lsmgeo.data.files import child, image_size, parse_floats, read_text
+from lsmgeo.data.files import child, image_size, parse_floats, read_text, refuse_unreadable
 from lsmgeo.data.posed import PosedImages
 from lsmgeo.errors import DataError
 
@@ -35,6 +35,7 @@ def is_strecha(path: Path) -> bool:
     return bool(camera_files(path)) if path.is_dir() else path.suffix == SUFFIX
 
 
+@refuse_unreadable
 def read_strecha(path: str | Path) -> PosedImages:
     """Read a scene in the form of Strecha's multi-view benchmark.
 
@@ -58,10 +59,7 @@ def read_strecha(path: str | Path) -> PosedImages:
             makes no sense, or is of another size than its photograph.
     """
     path = Path(path)
-    try:
-        files = camera_files(path if path.is_dir() else path.parent)
-    except OSError as error:
-        raise DataError(path, f"cannot be read ({error})") from error
+    files = camera_files(path if path.is_dir() else path.parent)
     folders = sorted({file.parent for file in files})
     if len(folders) != 1:
         found = ", ".join(folder.name for folder in folders[:5]) or "none"

@@ -13,7 +13,7 @@ from lsmgeo._checks import describe
 from lsmgeo.cameras import from_opengl
 from lsmgeo.data.assembling import MAX_PARAMETER, MAX_SIDE, as_data_error, assemble, check_picture, check_rotation
 from lsmgeo.data.depth_files import DepthFile, DepthPng
-from lsmgeo.data.files import child, has_alpha, image_size
+from lsmgeo.data.files import child, has_alpha, image_size, refuse_unreadable
 from lsmgeo.data.json_files import peek_json, read_json, take_array, take_number, take_text
 from lsmgeo.data.lenses import Lens
 from lsmgeo.data.posed import PosedImages
@@ -50,6 +50,7 @@ def is_transforms(path: Path) -> bool:
     return path.suffix.lower() == ".json" and isinstance(peek_json(path).get("frames"), list)
 
 
+@refuse_unreadable
 def read_transforms(path: str | Path) -> PosedImages:
     """Read a ``transforms.json`` of NeRF's Blender scenes, of instant-ngp or of nerfstudio.
 
@@ -95,7 +96,7 @@ def read_transforms(path: str | Path) -> PosedImages:
         where = f"frame {index}"
         if not isinstance(frame, dict):
             raise DataError(file, f"{where}: expected an object; got {describe(frame)}")
-        names.append(take_text(frame, "file_path", file, where))
+        names.append(_take_name(frame, "file_path", file, where))
         paths.append(_picture(file, names[-1]))
         size = image_size(paths[-1])
         cut_out = cut_out or has_alpha(paths[-1])
@@ -113,6 +114,11 @@ def read_transforms(path: str | Path) -> PosedImages:
     with as_data_error(file):
         cameras = from_opengl(torch.from_numpy(np.stack(intrinsics)), torch.from_numpy(np.stack(poses)), height, width)
     return assemble(names, paths, cameras, "transforms", file=file, lenses=lenses, depths=depths, cut_out=cut_out)
+
+
+def _take_name(frame: dict[str, Any], key: str, file: Path, where: str) -> str:
+    # Files made on Windows have backslashes between folders.
+    return take_text(frame, key, file, where).replace("\\", "/")
 
 
 def _picture(file: Path, name: str) -> Path:
@@ -225,7 +231,7 @@ class _Stated:
         frame = self.scopes[0]
         if "depth_file_path" not in frame:
             return None
-        name = take_text(frame, "depth_file_path", self.file, self.where)
+        name = _take_name(frame, "depth_file_path", self.file, self.where)
         step = self.number("depth_unit_scale_factor", DEPTH_STEP)
         if not step > 0:
             raise DataError(self.file, f"{self.where}: depth_unit_scale_factor must be positive; got {step:g}")

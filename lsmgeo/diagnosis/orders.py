@@ -68,7 +68,7 @@ def named_orders(names: Sequence[str]) -> list[tuple[np.ndarray, str]]:
         >>> from lsmgeo.diagnosis.orders import named_orders
         >>> order, words = named_orders(["frame_0", "frame_1", "frame_10", "frame_2"])[0]
         >>> order.tolist(), words
-        ([0, 1, 3, 2], "the names ordered by their numbers, not as text")
+        ([0, 1, 3, 2], 'the names ordered by their numbers, not as text')
     """
     rows = np.arange(len(names))
     text = np.array(sorted(range(len(names)), key=lambda row: names[row]), int)

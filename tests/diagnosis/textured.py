@@ -211,5 +211,11 @@ def planted(scene, mistake):
         K[:, :2, 2] += 0.5
         return with_cameras(scene, K=K)
     if mistake == "frames shuffled":
-        return in_order(scene, np.random.default_rng(3).permutation(len(scene)))
+        # A photograph of another size is refused before anything is measured.
+        sizes = np.array([scene.size(view) for view in range(len(scene))])
+        order, rng = np.arange(len(scene)), np.random.default_rng(3)
+        for size in np.unique(sizes, axis=0):
+            alike = np.flatnonzero((sizes == size).all(1))
+            order[alike] = rng.permutation(alike)
+        return in_order(scene, order)
     raise ValueError(mistake)

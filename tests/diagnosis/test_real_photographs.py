@@ -1,0 +1,64 @@
+"""Mistakes planted in real photographs of measured geometry are named, and the sets as they are are not accused."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lsmgeo import data
+from lsmgeo.diagnosis import evidence
+from lsmgeo.diagnosis.matching import match_features
+from lsmgeo.diagnosis.photographs import examine_photographs
+from tests.diagnosis.textured import planted
+
+ROOT = os.environ.get("LSMGEO_TEST_DATA")
+pytestmark = pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of real photographs")
+
+SETS = {
+    "middlebury_temple": ("epipolar", 0.16),
+    "strecha_fountain_quarter": ("epipolar", 0.09),
+    "colmap_scene": ("reprojection", 0.25),
+}
+MATCHES = {}
+
+
+@pytest.fixture(autouse=True)
+def same_matches(monkeypatch):
+    """Each set of photographs is matched once."""
+
+    def match(scene, views):
+        key = tuple(scene.paths)
+        if key not in MATCHES:
+            MATCHES[key] = match_features(scene, views)
+        return MATCHES[key]
+
+    monkeypatch.setattr(evidence, "match_features", match)
+
+
+def scene(name):
+    path = Path(ROOT) / name
+    if not path.is_dir():
+        pytest.skip(f"LSMGEO_TEST_DATA holds no {name}")
+    return data.open(path)
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_the_measured_figure_is_reached(name):
+    kind, expected = SETS[name]
+    findings = examine_photographs(scene(name)).findings
+    assert findings.verdict == "good"
+    check = next(check for check in findings.checks if kind in check.name)
+    assert check.measured > 1000
+    np.testing.assert_array_less(check.value, expected)
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    ["poses inverted", "OpenGL axes", "y flipped", "half a pixel", "K of another resolution", "frames shuffled"],
+)
+@pytest.mark.parametrize("name", SETS)
+def test_a_planted_mistake_is_named(name, mistake):
+    cause = examine_photographs(planted(scene(name), mistake)).findings.cause
+    assert cause is not None
+    assert cause.name == mistake

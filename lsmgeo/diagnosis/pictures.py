@@ -29,7 +29,7 @@ MOST_POINTS, MOST_MATCHES = 4000, 12
 MOST_NUMBERS, NUMBERS_APART = 100, 0.022
 LONGEST_SIDE = 900
 # Frusta are this long, as a part of the way to the nearest other camera and of the whole.
-FRUSTUM, FRUSTUM_OF_ALL = 0.6, 0.12
+FRUSTUM, FRUSTUM_OF_ALL, SHORTEST = 0.6, 0.12, 0.045
 
 
 def draw_examination(scene: PosedImages, examination: Examination, title: str) -> dict[str, tuple[str, bytes]]:
@@ -92,7 +92,8 @@ def _cameras(scene: PosedImages, examination: Examination, title: str) -> bytes:
     across /= np.linalg.norm(across)
     system = np.stack([across, np.cross(up, across), up])
     sizes = np.array([scene.size(view) for view in range(len(scene))])
-    figure = _figure(14, 7.4, title)
+    figure = _figure(14, 7.8, title)
+    figure.supxlabel("world units; thick: the upper side of the picture; dotted: the optical axis", fontsize=9)
     views = (("from above", 90.0), ("from aside", 25.0))
     for axes, (words, elevation) in zip(figure.subplots(1, 2), views, strict=True):
         axes.set_title(f"{len(cameras.K)} cameras {words}")
@@ -181,7 +182,6 @@ def _draw_cameras(
     axes.set_ylim(low[1] - margin, high[1] + margin)
     axes.set_aspect("equal")
     axes.tick_params(labelsize=7)
-    axes.set_xlabel("world units; thick: the upper side of the picture; dotted: the optical axis", fontsize=8)
 
 
 def _number(axes: Axes, placed: np.ndarray, length: float, span: float) -> None:
@@ -208,7 +208,7 @@ def _frustum_length(centers: np.ndarray, content: np.ndarray) -> float:
         return max(FRUSTUM_OF_ALL * whole, 1e-9) if whole > 0 else 1.0
     apart = np.linalg.norm(centers[:, None] - centers, axis=2) + np.where(np.eye(len(centers), dtype=bool), np.inf, 0)
     near = float(np.median(apart.min(1)))
-    return float(np.clip(FRUSTUM * near, 0.03 * whole, FRUSTUM_OF_ALL * whole)) or 1.0
+    return float(np.clip(FRUSTUM * near, SHORTEST * whole, FRUSTUM_OF_ALL * whole)) or 1.0
 
 
 def _shown(scene: PosedImages, view: int) -> tuple[np.ndarray, float]:

@@ -34,7 +34,7 @@ def report(findings: Findings) -> str:
         <BLANKLINE>
         verdict:          good: cameras and what they saw belong together
     """
-    lines = [f"{name + ':':<18}{text}" for name, text in findings.facts]
+    lines = [f"{name + ':':<17} {text}" for name, text in findings.facts]
     if findings.checks:
         lines += ["", f"{'check':<42}{'measured':>9}{'limit':>14}", *(_line(check) for check in findings.checks)]
     lines += ["", *(f"{'remark:':<18}{remark}" for remark in findings.remarks)]

@@ -305,6 +305,7 @@ def convert(
         jobs: for shards, worker processes; -1 takes all cores.
     """
     from lsmgeo import data
+    from lsmgeo.errors import OptionError
 
     if to == "shards":
         made = data.convert_set(scene, out, splits=splits, jobs=_jobs(jobs), progress=True)
@@ -312,6 +313,8 @@ def convert(
         _print_shards(made, out)
         _print_skipped(made, "objects")
         return
+    if splits is not None or jobs != -1:
+        raise OptionError(f"convert: splits and jobs are for shards; got to={to!r}")
     images = data.open(scene)
     write = {"colmap": data.write_colmap, "transforms": data.write_transforms, "cameras": data.write_cameras_json}[to]
     folder = write(images, out)

@@ -39,6 +39,8 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         try:
             if path.is_symlink() or (path.exists() and (not path.is_dir() or any(path.iterdir()))):
                 raise DataError(path, "is there already and not an empty folder; name a new one")
+            if path.resolve() == Path.cwd():
+                raise DataError(path, "is the current folder, which cannot be replaced; name a new one")
             path.parent.mkdir(parents=True, exist_ok=True)
             temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
         except OSError as error:

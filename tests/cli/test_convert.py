@@ -39,6 +39,7 @@ def test_distortion_is_said_to_be_gone(scene, tmp_path, capsys):
         (["--to", "nerf"], "to must be one of"),
         (["--to", "colmap"], "cameras must have no skew"),
         (["--to", "cameras", "--out", "{source}"], "is there already and not an empty folder"),
+        (["--to", "cameras", "--jobs", "2"], "splits and jobs are for shards"),
     ],
 )
 def test_what_cannot_be_written_gives_one_line_and_status_2(scene, tmp_path, capsys, arguments, message):
@@ -53,3 +54,12 @@ def test_what_cannot_be_written_gives_one_line_and_status_2(scene, tmp_path, cap
     assert message in captured.err
     assert captured.err.count("\n") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["source"]
+
+
+def test_the_current_folder_is_not_replaced(scene, tmp_path, capsys, monkeypatch):
+    write_colmap(scene, tmp_path / "source", form="binary")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert cli.main(["convert", str(tmp_path / "source"), "--out", "."]) == 2
+    assert "is the current folder" in capsys.readouterr().err
+    assert list((tmp_path / "here").iterdir()) == []

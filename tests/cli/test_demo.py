@@ -58,7 +58,7 @@ def test_questions_about_the_command_end_well(arguments, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], '"subcommand" to be one of {demo,reconstruct,render}'),
+        ([], '"subcommand" to be one of {demo,info,reconstruct,convert,render}'),
         (["dance"], "invalid choice: 'dance'"),
         (["--dance"], "unrecognized arguments: --dance"),
         (["demo", "--dance", "3"], "unrecognized arguments: --dance 3"),

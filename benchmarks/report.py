@@ -124,3 +124,25 @@ def rate_rows(cases: Sequence[Mapping[str, Any]]) -> Rows:
             [case["case"], f"{case['rate']:.0f} {case['unit']}", spread, f"{target:.0f}" if target else "—", met]
         )
     return rows
+
+
+def figure_rows(cases: Sequence[Mapping[str, Any]]) -> Rows:
+    """Set, figure, what is known of it, what was measured, and the verdict."""
+    rows = [["set", "measured", "known", "here", "verdict"]]
+    for case in cases:
+        known = f"{'at least' if case['at_least'] else 'at most'} {case['known']:g} {case['unit']}"
+        here = "—" if case["measured"] is None else f"{case['measured']:.3g} {case['unit']}"
+        verdict = case["verdict"] if case["cause"] is None else f"{case['verdict']}: {case['cause']}"
+        rows.append([case["set"], case["figure"], known, here if case["reached"] else f"{here} **missed**", verdict])
+    return rows
+
+
+def mistake_rows(cases: Sequence[Mapping[str, Any]]) -> Rows:
+    """One row a set, one column a planted mistake: whether it is named, else what is said."""
+    planted = list(dict.fromkeys(case["planted"] for case in cases))
+    said = {}
+    for case in cases:
+        named = case["named"] == case["planted"]
+        said[case["set"], case["planted"]] = "named" if named else case["named"] or case["verdict"]
+    sets = dict.fromkeys(case["set"] for case in cases)
+    return [["set", *planted], *([name, *(said.get((name, mistake), "—") for mistake in planted)] for name in sets)]

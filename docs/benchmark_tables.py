@@ -27,6 +27,8 @@ TABLES: dict[str, Callable[[list[dict[str, Any]]], report.Rows]] = {
     "compiling": report.first_call_rows,
     "left-out": report.left_out_rows,
     "rates": report.rate_rows,
+    "figures": report.figure_rows,
+    "mistakes": report.mistake_rows,
 }
 
 

@@ -8,7 +8,7 @@ import json
 import pytest
 import torch
 
-from benchmarks import compiled, contenders, gate, kernel, loading, memory, report, scenes, timing
+from benchmarks import compiled, contenders, gate, kernel, known_sets, loading, memory, report, scenes, timing
 from benchmarks.measure import timings
 from benchmarks.problems import LeftOut, Problem, Scene
 from benchmarks.settings import TINY, Settings
@@ -129,6 +129,40 @@ def test_rates_are_held_against_their_goals():
         ["b", "3 shapes/s", "one run", "4", "**missed**"],
         ["c", "8 views/s", "7 to 9", "—", ""],
     ]
+
+
+def test_figures_and_planted_mistakes_make_tables():
+    row = {
+        "set": "a",
+        "figure": "error",
+        "unit": "px",
+        "known": 0.16,
+        "at_least": False,
+        "verdict": "good",
+        "cause": None,
+    }
+    shared = {**row, "at_least": True, "known": 99.9, "unit": "%", "verdict": "bad", "cause": "y flipped"}
+    found = [{**row, "measured": 0.1634, "reached": True}, {**shared, "measured": 98.0, "reached": False}]
+    assert report.figure_rows(found)[1:] == [
+        ["a", "error", "at most 0.16 px", "0.163 px", "good"],
+        ["a", "error", "at least 99.9 %", "98 % **missed**", "bad: y flipped"],
+    ]
+    planted = [
+        {"set": "a", "planted": "p", "named": "p", "verdict": "bad"},
+        {"set": "a", "planted": "q", "named": None, "verdict": "good"},
+        {"set": "b", "planted": "q", "named": "r", "verdict": "bad"},
+    ]
+    assert report.mistake_rows(planted) == [["set", "p", "q"], ["a", "named", "good"], ["b", "—", "r"]]
+
+
+@pytest.mark.parametrize(
+    ("value", "measured", "at_least", "reached"),
+    [("0.16", 0.1649, False, True), ("0.16", 0.1651, False, False), ("3.0", 3.06, False, False),
+     ("3.0", 3.04, False, True), ("0.217", 0.2174, False, True), ("99.9", 99.86, True, True),
+     ("99.9", 99.84, True, False), ("100.0", 99.94, True, False)],
+)  # fmt: skip
+def test_a_figure_is_reached_in_the_digits_that_it_has(value, measured, at_least, reached):
+    assert known_sets.reached(known_sets.Figure("error", value, "px", at_least), measured) == reached
 
 
 def test_the_benchmarks_of_training_data_run(capsys):

@@ -24,7 +24,7 @@ __all__ = ["assigned", "named_orders", "order_mistakes", "search_order"]
 
 # Costs saturate at so many limits: a wrong pair of cameras is wrong, whether by ten pixels or by a hundred.
 WORST = 4.0
-SEEDS_PER_PAIR, SEEDED_PAIRS, ROUNDS = 40, 4, 4
+SEEDS_PER_PAIR, SEEDED_PAIRS, ROUNDS, LEAST_GAIN = 40, 4, 4, 1e-12
 MATCHES_TRIED = 40
 # Outlines are compared one by one: only few views bear all their pairs under all pairs of cameras.
 MOST_OUTLINES = 16
@@ -208,51 +208,85 @@ def search_order(first: np.ndarray, second: np.ndarray, costs: np.ndarray) -> np
         links[a].append((b, costs[pair].T))  # row: camera of b, column: camera of a
         links[b].append((a, costs[pair]))
 
-    def total(order: np.ndarray) -> float:
-        return float(costs[np.arange(len(first)), order[first], order[second]].sum())
-
     # Pairs whose cheapest cameras stand out most tell most.
-    cheap = np.partition(costs.reshape(len(costs), -1), min(count, costs[0].size - 1), axis=1)
-    telling = np.argsort(-(cheap.mean(1) - cheap[:, : count + 1].min(1)), kind="stable")[:SEEDED_PAIRS]
-    best = np.arange(count)
-    lowest = total(best)
-    for pair in telling.tolist():
-        for place in np.argsort(costs[pair].ravel(), kind="stable")[:SEEDS_PER_PAIR].tolist():
-            i, j = divmod(place, count)
-            if i != j:
-                order = _grown({int(first[pair]): i, int(second[pair]): j}, links, count)
-                if (cost := total(order)) < lowest:
-                    best, lowest = order, cost
-    for _ in range(ROUNDS):
-        before = lowest
-        for a, b in itertools.combinations(range(count), 2):
-            order = best.copy()
-            order[[a, b]] = order[[b, a]]
-            if (cost := total(order)) < lowest - 1e-12:
-                best, lowest = order, cost
-        if lowest == before:
-            break
-    return best
+    cheap = np.partition(costs.reshape(len(costs), -1), min(count, costs[0].size - 1), axis=1)[:, : count + 1]
+    telling = np.argsort(-(cheap.mean(1) - cheap.min(1)), kind="stable")
+    cameras: dict[int, int] = {}
+    for views in _connected(links):
+        within = np.array([pair for pair in telling.tolist() if first[pair] in views])
+        best: dict[int, int] = {}
+        lowest = np.inf
+        for pair in within[:SEEDED_PAIRS].tolist():
+            for place in np.argsort(costs[pair].ravel(), kind="stable")[:SEEDS_PER_PAIR].tolist():
+                i, j = divmod(place, count)
+                if i == j or {i, j} & set(cameras.values()):
+                    continue
+                grown = _grown({int(first[pair]): i, int(second[pair]): j}, links, views, set(cameras.values()))
+                places = [(grown[int(first[other])], grown[int(second[other])]) for other in within]
+                cost = sum(float(costs[other][place]) for other, place in zip(within, places, strict=True))
+                if cost < lowest:
+                    best, lowest = grown, cost
+        cameras |= best
+    return _improved(_completed(cameras, count), first, second, costs)
 
 
-def _grown(cameras: dict[int, int], links: list[list[tuple[int, np.ndarray]]], count: int) -> np.ndarray:
-    """Views added one by one at the free camera that their linked views agree on best."""
-    free = np.ones(count, bool)
-    free[list(cameras.values())] = False
-    while len(cameras) < count:
-        tied = {
-            view: [link for link in links[view] if link[0] in cameras] for view in range(count) if view not in cameras
-        }
+def _connected(links: list[list[tuple[int, np.ndarray]]]) -> list[set[int]]:
+    """Groups of views that pairs connect, largest first."""
+    groups: list[set[int]] = []
+    for start in range(len(links)):
+        if links[start] and not any(start in group for group in groups):
+            group, edge = {start}, [start]
+            while edge:
+                fresh = {other for other, _ in links[edge.pop()]} - group
+                group |= fresh
+                edge += sorted(fresh)
+            groups.append(group)
+    return sorted(groups, key=len, reverse=True)
+
+
+def _grown(
+    cameras: dict[int, int], links: list[list[tuple[int, np.ndarray]]], views: set[int], taken: set[int]
+) -> dict[int, int]:
+    """The views of a group added one by one at the free camera that those they are linked to agree on best."""
+    free = np.ones(len(links), bool)
+    free[[*taken, *cameras.values()]] = False
+    while len(cameras) < len(views):
+        tied = {view: [link for link in links[view] if link[0] in cameras] for view in sorted(views - cameras.keys())}
         view = max(tied, key=lambda view: len(tied[view]))
-        if not tied[view]:
-            break
         against = np.sum([table[cameras[other]] for other, table in tied[view]], axis=0)
         against[~free] = np.inf
         cameras[view] = int(against.argmin())
         free[cameras[view]] = False
+    return cameras
+
+
+def _completed(cameras: dict[int, int], count: int) -> np.ndarray:
+    """Views of which nothing is known keep their camera where it is free."""
     order = np.full(count, -1)
     order[list(cameras)] = list(cameras.values())
-    for view in np.flatnonzero(order < 0).tolist():
-        order[view] = view if free[view] else np.flatnonzero(free)[0]
-        free[order[view]] = False
+    free = np.ones(count, bool)
+    free[list(cameras.values())] = False
+    unknown = np.flatnonzero(order < 0)
+    kept = unknown[free[unknown]]
+    order[kept], free[kept] = kept, False
+    order[order < 0] = np.flatnonzero(free)
+    return order
+
+
+def _improved(order: np.ndarray, first: np.ndarray, second: np.ndarray, costs: np.ndarray) -> np.ndarray:
+    """Cameras of two views exchanged as long as that mends something."""
+
+    def total(order: np.ndarray) -> float:
+        return float(costs[np.arange(len(first)), order[first], order[second]].sum())
+
+    lowest = total(order)
+    for _ in range(ROUNDS):
+        before = lowest
+        for a, b in itertools.combinations(range(len(order)), 2):
+            other = order.copy()
+            other[[a, b]] = order[[b, a]]
+            if (cost := total(other)) < lowest - LEAST_GAIN:
+                order, lowest = other, cost
+        if lowest == before:
+            break
     return order

@@ -150,7 +150,10 @@ def _off_by_features(features: Features, asis: Hypothesis) -> tuple[set[int], se
     """Views all of whose pairs are bad, taken away one by one until the others agree."""
     first, second = features.matches.first, features.matches.second
     medians = features.pair_medians(asis)
-    bad = medians > max(LIMITS["view"] * features.limit, LIMITS["view"] * float(np.median(medians)))
+    # Where most pairs are bad, no single view is.
+    if not np.median(medians) <= features.limit:
+        return set(), set()
+    bad = medians > LIMITS["view"] * features.limit
     left = np.ones(len(first), bool)
     off: set[int] = set()
     while (bad & left).any():
@@ -175,5 +178,7 @@ def _off_by_points(points: Points, asis: Hypothesis) -> tuple[set[int], set[int]
     medians = np.array([np.median(errors[views == view]) for view in known])
     if not known:
         return set(), set()
-    limit = LIMITS["view"] * max(points.limit, float(np.median(medians)))
+    if not np.median(medians) <= points.limit:
+        return set(), set()
+    limit = LIMITS["view"] * points.limit
     return {int(view) for view, median in zip(known, medians, strict=True) if median > limit}, {int(v) for v in known}

@@ -63,7 +63,8 @@ def read_transforms(path: str | Path) -> PosedImages:
         OpenGL axes (x right, y up, z backwards) become OpenCV's, and camera-to-world world-to-camera. Pixel centres
         are half-integer: principal points lose 0.5. What the file leaves out is the picture's size and its middle.
         A rotation with a scale in it is refused, not divided by it. ``depth_file_path`` is a 16-bit PNG in
-        millimetres unless ``depth_unit_scale_factor`` says otherwise, camera z. Masks are not read.
+        millimetres unless ``depth_unit_scale_factor`` says otherwise, camera z; where it has fewer or more pixels than
+        its photograph, and is of the same shape, its nearest pixels are taken. Masks are not read.
 
     Args:
         path: the file, or a folder with ``transforms.json`` or with one ``transforms_*.json``.
@@ -235,4 +236,5 @@ class _Stated:
         step = self.number("depth_unit_scale_factor", DEPTH_STEP)
         if not step > 0:
             raise DataError(self.file, f"{self.where}: depth_unit_scale_factor must be positive; got {step:g}")
-        return DepthPng(child(self.file.parent, name, self.file), step)
+        # Exports of telephones have depth of fewer pixels than their photographs.
+        return DepthPng(child(self.file.parent, name, self.file), step, any_size=True)

@@ -1,6 +1,7 @@
 """``transforms.json`` written by code that shares nothing with the reader, and lenses against a closed form."""
 
 import json
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -107,6 +108,28 @@ def test_depth_is_in_millimetres_or_in_what_is_said(scene, tmp_path, scale, step
     read = data.open(tmp_path)
     np.testing.assert_allclose(read.load_depth(1).numpy(), (counts * step).astype(np.float32), rtol=1e-6)
     assert read.load_depth(0) is None
+
+
+def write_depth(scene, folder, counts):
+    write_transforms(scene, folder, lambda values: values["frames"][1].update(depth_file_path="depth.png"))
+    Image.fromarray(counts).save(folder / "depth.png")
+    return data.open(folder)
+
+
+@pytest.mark.parametrize("size", [(15, 20), (45, 59), (90, 118), (23, 30), (1, 1)])
+def test_depth_of_other_sizes_is_taken_at_its_nearest_pixels(scene, tmp_path, size):
+    counts = np.arange(1, size[0] * size[1] + 1, dtype=np.uint16).reshape(size)
+    depth = write_depth(scene, tmp_path, counts).load_depth(1).numpy()
+    assert depth.shape == (45, 59)
+    for row, column in ((0, 0), (7, 3), (22, 29), (31, 40), (44, 58)):
+        there = (int(Fraction(2 * row + 1, 90) * size[0]), int(Fraction(2 * column + 1, 118) * size[1]))
+        np.testing.assert_allclose(depth[row, column], 0.001 * counts[there], rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(20, 15), (45, 57), (1, 59), (43, 59)])
+def test_depth_of_another_shape_than_its_photograph_is_refused(scene, tmp_path, size):
+    with pytest.raises(DataError, match=r"depth\.png.*not of the shape of its photograph, 59 x 45"):
+        write_depth(scene, tmp_path, np.ones(size, np.uint16)).load_depth(1)
 
 
 LENSES = {

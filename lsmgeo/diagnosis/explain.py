@@ -162,7 +162,9 @@ def _refined(scales: np.ndarray, evidence: Sequence[Evidence], make: Callable[[f
     logarithms = np.log(scales)
     step = logarithms[1] - logarithms[0]
     middle = logarithms[int(np.argmin([cost(value) for value in logarithms]))]
-    found = minimize_scalar(cost, bounds=(middle - step, middle + step), method="bounded", options={"maxiter": 25})
+    found = minimize_scalar(
+        cost, bounds=(middle - step, middle + step), method="bounded", options={"maxiter": 15, "xatol": 1e-3}
+    )
     scale = float(np.exp(found.x))
     near = [nice for nice in NICE if abs(np.log(scale / nice)) < NEAR]
     return [make(value) for value in (*near, scale) if abs(np.log(value)) > NEAR]

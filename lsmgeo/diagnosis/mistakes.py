@@ -19,7 +19,7 @@ DIRECTIONS = (("right", "left"), ("down", "up"), ("forward", "back"))
 OPENGL = np.diag([1.0, -1.0, -1.0])
 FLIP = np.diag([1.0, -1.0, 1.0])
 # Scales between which K of another resolution is sought; the search refines what is best.
-SCALES = np.geomspace(1 / 8, 8, 61)
+SCALES = np.geomspace(1 / 8, 8, 31)
 UNITS = (1000.0, 100.0, 10.0, 5.0, 25.4, 2.54, 4.0, 2.0, 256.0)
 
 

@@ -23,6 +23,7 @@ from tests.diagnosis.textured import (
     write,
 )
 
+LONG = pytest.mark.long
 COMMON = ["poses inverted", "OpenGL axes", "y flipped", "K of another resolution", "frames shuffled"]
 RARE = [
     "poses inverted and OpenGL axes",
@@ -94,7 +95,7 @@ def test_right_cameras_are_good(photographs):
     assert check(findings, "agree with the others").value == 100
 
 
-@pytest.mark.parametrize("mistake", [*COMMON, *RARE])
+@pytest.mark.parametrize("mistake", [*COMMON, RARE[0], *(pytest.param(rare, marks=LONG) for rare in RARE[1:])])
 def test_a_mistake_is_told_from_features_alone(photographs, mistake):
     findings = examine_photographs(planted(photographs, mistake)).findings
     assert findings.verdict == "bad"
@@ -177,7 +178,15 @@ def test_moving_and_scaling_the_world_changes_nothing(room, photographs):
     np.testing.assert_allclose([c.value for c in after.checks], [c.value for c in before.checks], rtol=1e-6)
 
 
-@pytest.mark.parametrize("mistake", [*COMMON, "rotation transposed", "centre taken as translation", "half a pixel"])
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        *COMMON,
+        "half a pixel",
+        pytest.param("rotation transposed", marks=LONG),
+        pytest.param("centre taken as translation", marks=LONG),
+    ],
+)
 def test_a_mistake_is_told_from_points_alone(room, blank, mistake):
     scene = with_points(blank, room)
     assert examine_photographs(scene).findings.verdict == "good"
@@ -197,7 +206,15 @@ def test_reprojection_error_is_that_of_the_noise(room, blank):
     np.testing.assert_allclose(check(findings, "reprojection").value, 0.3 * np.sqrt(2 * np.log(2)), rtol=0.1)
 
 
-@pytest.mark.parametrize("mistake", ["poses inverted", "OpenGL axes", "y flipped", "K of another resolution"])
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        "poses inverted",
+        pytest.param("OpenGL axes", marks=LONG),
+        pytest.param("y flipped", marks=LONG),
+        pytest.param("K of another resolution", marks=LONG),
+    ],
+)
 def test_a_mistake_is_told_from_depth_alone(room, blank, mistake):
     scene = with_depth(blank, room)
     good = examine_photographs(scene).findings
@@ -220,7 +237,7 @@ def test_depth_in_millimetres_and_along_the_ray_are_named(room, blank):
 
 
 @pytest.mark.parametrize("mistake", COMMON)
-@pytest.mark.parametrize("solid", [False, True])
+@pytest.mark.parametrize("solid", [False, pytest.param(True, marks=LONG)])
 def test_a_mistake_is_told_from_outlines_alone(cut_out, solid, mistake):
     scene = with_voxels(cut_out) if solid else cut_out
     good = examine_photographs(scene).findings

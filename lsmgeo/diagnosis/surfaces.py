@@ -25,8 +25,9 @@ __all__ = [
 # Pixels of a view that are carried into others, and pixels that are kept of a map.
 SAMPLES = 3000
 MAX_MAP = 1 << 20
-# Of the neighbours into which most of a view falls, the one counts that agrees best: in others it may be hidden.
-NEIGHBOURS = 4
+# Of the neighbours into which nearly most of a view falls, the one counts that agrees best: all around an object it
+# falls into every view whole, and is hidden in half of them.
+NEARLY_MOST = 0.7
 LEAST_SEEN = 0.02
 
 
@@ -123,7 +124,7 @@ def _seen(surfaces: Surfaces, hypothesis: Hypothesis, points: np.ndarray, view: 
 def relative_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
     """Signed relative differences of depth, carried over against measured there, and the view carried, (M,) and (M,).
 
-    Of each view, the few neighbours are asked into which most of its pixels fall under this very hypothesis (cameras
+    Of each view, the neighbours are asked into which nearly most of its pixels fall under this very hypothesis (cameras
     that are wrong may place views anywhere), and of them the one counts that agrees best. Pixels that another surface
     hides give large differences; the median bears them.
     """
@@ -145,9 +146,10 @@ def seen_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> dict[int, tuple[i
                 known = np.isfinite(there)
                 if known.mean() >= LEAST_SEEN:
                     found.append((other, known, (depth[known] - there[known]) / there[known]))
-        found = sorted(found, key=lambda row: len(row[2]), reverse=True)[:NEIGHBOURS]
         if found:
-            best[view] = min(found, key=lambda row: float(np.median(np.abs(row[2]))))
+            most = max(len(errors) for _, _, errors in found)
+            near = [row for row in found if len(row[2]) >= NEARLY_MOST * most]
+            best[view] = min(near, key=lambda row: float(np.median(np.abs(row[2]))))
     return best
 
 

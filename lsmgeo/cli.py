@@ -248,7 +248,7 @@ def _jobs(jobs: int) -> int:
     from importlib.util import find_spec
 
     if jobs == -1 and not find_spec("joblib"):
-        print("lsmgeo: one process works; pip install 'lsmgeo[data]' lets all cores work", file=sys.stderr)
+        print("lsmgeo: one process works; joblib (of the extra data) lets all cores work", file=sys.stderr)
         return 1
     return jobs
 
@@ -321,7 +321,7 @@ def convert(
     left = [
         what
         for what, there in (
-            ("points", images.points is not None and to != "colmap"),
+            ("points", images.points is not None and len(images.points.positions) > 0 and to != "colmap"),
             ("depth", images.depths is not None),
             ("voxels", images.voxels is not None),
         )
@@ -332,7 +332,7 @@ def convert(
     if bent:
         print(f"straight:    {bent} photographs had distortion and are written without, as PNG")
     if left:
-        print(f"left out:    {', '.join(left)}, which this form does not hold here")
+        print(f"left out:    {', '.join(left)}: {to} is written without")
     print(f"written:     {to} in {folder.resolve()}")
 
 

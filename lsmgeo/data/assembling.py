@@ -83,7 +83,7 @@ def check_picture(stated: tuple[float, float], found: tuple[int, int], picture: 
         raise DataError(
             file,
             f"{where}: the camera is of {stated[1]:g} x {stated[0]:g} pixels and {picture.name!r} has "
-            f"{found[1]} x {found[0]} (width x height): K of another resolution",
+            f"{found[1]} x {found[0]} (width x height): K of another resolution (lsmgeo.cameras.resize makes K follow)",
         )
 
 

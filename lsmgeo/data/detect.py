@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -25,6 +26,18 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 __all__ = ["FORMATS", "Format", "detect", "open_scene"]
+
+
+PICTURES = (".png", ".jpg", ".jpeg")
+MOST_LOOKED_AT = 1000
+# What lies in an object of the LSM release, and in one of 3D-R2N2's, below the folder of many.
+TREES = (
+    "renders/*/*/camera_0.mat",
+    "*/*/camera_0.mat",
+    "*/rendering/rendering_metadata.txt",
+    "*/*/rendering/rendering_metadata.txt",
+    "*/*/*/rendering/rendering_metadata.txt",
+)
 
 
 class Format(NamedTuple):
@@ -95,9 +108,29 @@ def detect(path: str | Path) -> Format:
         several = " and ".join(candidate.needs for candidate in found)
         raise DataError(path, f"holds {several}; name the one file or folder that is meant")
     if not found:
-        needs = ", ".join(candidate.needs for candidate in FORMATS)
-        raise DataError(path, f"holds nothing that can be read: none of {needs}")
+        raise DataError(path, _why_nothing(path))
     return found[0]
+
+
+def _why_nothing(path: Path) -> str:
+    """What is said of a path in which no format is found: the likely slip first."""
+    pictures, others = [], False
+    for item in islice(path.iterdir(), MOST_LOOKED_AT) if path.is_dir() else [path]:
+        if item.suffix.lower() in PICTURES:
+            pictures.append(item)
+        others = others or item not in pictures
+    if path.is_file() and pictures:
+        return "is a picture; name the folder of its cameras"
+    if not pictures and not others:
+        return "is empty"
+    for pattern in TREES:
+        inside = next(path.glob(pattern), None) if path.is_dir() else None
+        if inside is not None:
+            return f"is a tree of many objects; name one of them, such as {inside.parent}, or convert it to shards"
+    known = f"cameras are read from {', '.join(candidate.needs for candidate in FORMATS)}"
+    if pictures and not others:
+        return f"holds pictures and no file of cameras; {known}"
+    return f"holds nothing that can be read; {known}"
 
 
 def open_scene(path: str | Path) -> PosedImages:

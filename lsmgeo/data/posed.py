@@ -86,6 +86,13 @@ class PosedImages:
     def __len__(self) -> int:
         return len(self.names)
 
+    def __repr__(self) -> str:
+        """How many of which sizes, and what came with them."""
+        sizes = list(dict.fromkeys(self.size(view) for view in range(len(self))))
+        size = f"{sizes[0][1]} x {sizes[0][0]}" if len(sizes) == 1 else f"{len(sizes)} sizes"
+        beside = [name for name in ("points", "lenses", "depths", "voxels") if getattr(self, name) is not None]
+        return f"<PosedImages: {len(self)} x {size}, {', '.join((self.source, *beside))}>"
+
     def camera(self, view: int) -> CameraTensors:
         """The camera of one view, leading shape ()."""
         return type(self.cameras)(*(torch.as_tensor(value)[view] for value in self.cameras))
@@ -173,7 +180,8 @@ class PosedImages:
             (first, name), (second, other) = list(sizes.items())[:2]
             raise ShapeError(
                 "sample: photographs must be of one size; "
-                f"{name!r} is {first[0]} x {first[1]} (height x width), {other!r} {second[0]} x {second[1]}"
+                f"{name!r} is {first[0]} x {first[1]} (height x width), {other!r} {second[0]} x {second[1]}: "
+                "choose views of one size, or load them one by one"
             )
         images = torch.stack([self.load(view) for view in chosen])
         cameras = type(self.cameras)(*(torch.as_tensor(value)[chosen] for value in self.cameras))

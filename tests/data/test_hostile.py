@@ -138,7 +138,7 @@ def test_a_binary_camera_that_opencv_lacks_is_named(tmp_path):
 
 
 def test_other_folders_say_what_is_missing(tmp_path):
-    refused(tmp_path, "none of a Middlebury")
+    refused(tmp_path, "is empty")
     refused(tmp_path / "nowhere", "no such file or folder")
     write_middlebury(SCENE, tmp_path)
     (tmp_path / "other_par.txt").write_text("1\n")

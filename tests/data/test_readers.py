@@ -143,3 +143,28 @@ def test_a_point_cloud_that_makes_no_sense_is_refused(tmp_path, positions, colou
     with pytest.raises(DataError):
         data.write_point_cloud(tmp_path / "points.ply", positions, colours)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_scene_is_told_by_what_is_there(scene, tmp_path):
+    def refused(path, match):
+        with pytest.raises(DataError, match=match):
+            data.open(path)
+
+    (tmp_path / "empty").mkdir()
+    refused(tmp_path / "empty", "is empty")
+    (tmp_path / "pictures").mkdir()
+    Image.fromarray(scene.images[0]).save(tmp_path / "pictures" / "a.png")
+    refused(tmp_path / "pictures", "holds pictures and no file of cameras; cameras are read from a Middlebury")
+    refused(tmp_path / "pictures" / "a.png", "is a picture; name the folder of its cameras")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("nothing")
+    refused(tmp_path / "other", "holds nothing that can be read; cameras are read from")
+    chair = tmp_path / "tree" / "renders" / "03001627" / "chair"
+    chair.mkdir(parents=True)
+    (chair / "camera_0.mat").write_bytes(b"")
+    refused(tmp_path / "tree", "is a tree of many objects; name one of them, such as .*chair, or convert")
+
+
+def test_a_scene_is_shown_in_a_line(scene, tmp_path):
+    read = data.open(write_colmap(scene, tmp_path, form="binary"))
+    assert repr(read) == "<PosedImages: 5 x 96 x 72, colmap, points>"

@@ -9,7 +9,7 @@ import numpy as np
 
 from lsmgeo.diagnosis.epipolar import in_front, sampson_distances
 from lsmgeo.diagnosis.findings import Check
-from lsmgeo.diagnosis.limits import CENTRED, LIMITS, pixel_limit
+from lsmgeo.diagnosis.limits import CENTRED, LIMITS, SIDES, pixel_limit
 from lsmgeo.diagnosis.matching import Matches, grey_picture, match_features
 from lsmgeo.diagnosis.outlines import epipolar_tangency, outline
 from lsmgeo.diagnosis.silhouettes import load_silhouettes, near_cells, occupied_centers, overlap, within_a_cell
@@ -102,9 +102,9 @@ class Features:
         if self.judges_sides:
             front = in_front(matches, hypothesis.photographs)
             front = front[np.isfinite(front)]
-            share = 100 * float(front.mean()) if len(front) else 0.0
-            name = "matched features in front of both cameras"
-            checks.append(Check(name, share, "%", LIMITS["in front"], len(front), "matches", at_least=True))
+            # Cameras in one place have no parallax, and nothing speaks against them.
+            share = 100 * float(front.mean()) if len(front) else 100.0
+            checks.append(Check(SIDES, share, "%", LIMITS["in front"], len(front), "matches", at_least=True))
         return checks
 
     def pair_medians(self, hypothesis: Hypothesis) -> np.ndarray:

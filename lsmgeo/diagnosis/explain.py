@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.limits import badness
+from lsmgeo.diagnosis.limits import CENTRED, SIDES, badness
 from lsmgeo.diagnosis.mistakes import (
     SCALES,
     Candidate,
@@ -25,12 +25,14 @@ if TYPE_CHECKING:
     from lsmgeo.diagnosis.findings import Check
     from lsmgeo.diagnosis.geometry import Hypothesis
 
-__all__ = ["Explanation", "explain", "is_decisive", "score"]
+__all__ = ["Explanation", "explain", "invisible_mistakes", "is_decisive", "is_suspicious", "score"]
 
 # By what factor an error must fall that stays beyond its limit; and how good is as good as the best.
 DECISIVE, TIE, RIVAL = 4.0, 0.05, 0.35
 # A check that passed may not come nearer to its limit than this.
 PASSED = 1.0
+# A check this near to its limit is looked into though it passes.
+SUSPICIOUS = 0.5
 FINALISTS = 16
 # Of mistakes that explain the same, the one that is made more often is named.
 COMMON = (
@@ -70,11 +72,22 @@ def score(checks: Sequence[Check]) -> float:
     return float(np.mean(np.log([badness(check) for check in checks])))
 
 
+def is_suspicious(checks: Sequence[Check]) -> bool:
+    """Whether a check failed, or is so near to its limit that it is looked into."""
+    return any(badness(check) > _suspicious_from(check) for check in checks)
+
+
+def _suspicious_from(check: Check) -> float:
+    # One of few pairs may be bad by itself, and mistakes that concern all cameras put more matches behind them.
+    at_most_one = check.at_least and (100 - check.value) * check.measured <= 100 * (1 + 1e-9)
+    return PASSED if check.name in (CENTRED, SIDES) or at_most_one else SUSPICIOUS
+
+
 def is_decisive(before: Sequence[Check], after: Sequence[Check]) -> bool:
     """Whether a correction mends what failed, or where nothing did, brings an error down much; and spoils nothing."""
-    pairs = [(badness(old), badness(new)) for old, new in zip(before, after, strict=True)]
-    mended = all(new <= PASSED or (old > PASSED and new <= old / DECISIVE) for old, new in pairs)
-    better = any(new <= max(old, PASSED) / DECISIVE or (old > PASSED >= new) for old, new in pairs if old > PASSED / 2)
+    rows = [(badness(old), badness(new), _suspicious_from(old)) for old, new in zip(before, after, strict=True)]
+    mended = all(new <= PASSED or (old > PASSED and new <= old / DECISIVE) for old, new, _ in rows)
+    better = any(new <= max(old, PASSED) / DECISIVE or (old > PASSED >= new) for old, new, least in rows if old > least)
     return mended and better
 
 
@@ -137,6 +150,19 @@ def explain(
         for hypothesis in (asis, best.hypothesis)
     ]
     return Explanation(best, told[0], told[1], tuple(rivals)), tried
+
+
+def invisible_mistakes(asis: Hypothesis, evidence: Sequence[Evidence], sizes: np.ndarray) -> tuple[str, ...]:
+    """Names of common mistakes that would have passed all checks: cameras that are right do not show that they are.
+
+    Args:
+        asis: the cameras as they are, which pass.
+        evidence: what can be measured again.
+        sizes: (V, 2) height and width of the photographs.
+    """
+    planted = [*camera_mistakes(asis, sizes), scaled(asis, np.full(2, 0.5))]
+    usual = {candidate.name: candidate.hypothesis for candidate in reversed(planted) if candidate.name in COMMON[:4]}
+    return tuple(name for name in COMMON[:4] if not is_suspicious(_measured(evidence, usual[name])))
 
 
 def _measured(evidence: Sequence[Evidence], hypothesis: Hypothesis) -> list[Check]:

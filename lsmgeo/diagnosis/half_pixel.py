@@ -16,14 +16,17 @@ if TYPE_CHECKING:
     from lsmgeo.diagnosis.evidence import Evidence
     from lsmgeo.diagnosis.geometry import Geometry
 
-__all__ = ["Shift", "find_shifts", "is_certain", "is_half_a_pixel"]
+__all__ = ["Shift", "find_shifts", "is_certain", "is_half_a_pixel", "is_large"]
 
 STEP = 0.25  # px, for derivatives
 ITERATIONS = 20
 # Real calibrations are off by so much, px, and more by chance: half a pixel has to be this much likelier than none.
 SYSTEMATIC, LEAST_GAIN = 0.12, 9.0
+# What is another shift than that by half a pixel is none, however large it is.
+MOST_LEFT = 16.0
 # Shifts less certain than this, px, tell nothing of half a pixel along both axes.
 LARGEST_ERROR = 0.35
+LARGE = 1.0  # px
 # Errors of the views' own calibration are told from a common one by leaving views out: fewer tell nothing.
 LEAST_VIEWS = 4
 LARGEST_SLOPE = 10.0  # an epipole nearby
@@ -67,13 +70,15 @@ def find_shifts(evidence: Sequence[Evidence], cameras: Geometry) -> list[Shift]:
 
 
 def is_half_a_pixel(shift: Shift) -> bool:
-    """Whether half a pixel along both axes, to the same side, is much likelier than nothing.
+    """Whether half a pixel along both axes, to the same side, is much likelier than nothing, and is what was found.
 
     Example:
         >>> from lsmgeo.diagnosis.half_pixel import Shift, is_half_a_pixel
         >>> is_half_a_pixel(Shift("matched features", 0.55, 0.48, 0.05, 0.05))
         True
         >>> is_half_a_pixel(Shift("matched features", 0.2, 0.1, 0.05, 0.05))
+        False
+        >>> is_half_a_pixel(Shift("matched features", 0.1, 5.9, 0.05, 0.05))
         False
     """
     errors = np.array([shift.error_x, shift.error_y])
@@ -82,8 +87,14 @@ def is_half_a_pixel(shift: Shift) -> bool:
     def distance(expected: float) -> float:
         return float(((found - expected) ** 2 / (errors**2 + SYSTEMATIC**2)).sum())
 
-    gain = distance(0.0) - min(distance(0.5), distance(-0.5))
-    return bool(gain >= LEAST_GAIN) and is_certain(shift)
+    left = min(distance(0.5), distance(-0.5))
+    return distance(0.0) - left >= LEAST_GAIN and left <= MOST_LEFT and is_certain(shift)
+
+
+def is_large(shift: Shift) -> bool:
+    """Whether principal points are certainly off by more than a pixel."""
+    found, errors = np.abs([shift.x, shift.y]), np.array([shift.error_x, shift.error_y])
+    return is_certain(shift) and bool((found - 3 * errors > LARGE).any())
 
 
 def is_certain(shift: Shift) -> bool:

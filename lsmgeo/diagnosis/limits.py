@@ -6,7 +6,7 @@ import numpy as np
 
 from lsmgeo.diagnosis.findings import Check
 
-__all__ = ["CENTRED", "LIMITS", "badness", "pixel_limit"]
+__all__ = ["CENTRED", "LIMITS", "SIDES", "badness", "pixel_limit"]
 
 # Good sets stay at a quarter of these or below; the mistakes that people make go beyond by ten times and more.
 LIMITS = {
@@ -26,6 +26,7 @@ LIMITS = {
 LEAST_BADNESS, MOST_BADNESS = 0.02, 1e6
 # A principal point in the very middle is no better than one that lies well.
 CENTRED = "principal point off the middle"
+SIDES = "matched features in front of both cameras"
 
 
 def pixel_limit(sizes: np.ndarray) -> float:

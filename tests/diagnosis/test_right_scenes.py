@@ -1,12 +1,15 @@
-"""Right scenes in which it is easy to be mistaken: nothing is said against them."""
+"""Scenes in which it is easy to be mistaken: right ones are not accused, and what cannot be seen is said."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from lsmgeo.diagnosis.explain import is_decisive, is_suspicious
+from lsmgeo.diagnosis.findings import Check
+from lsmgeo.diagnosis.half_pixel import Shift, is_half_a_pixel, is_large
 from lsmgeo.diagnosis.photographs import examine_photographs
-from tests.diagnosis.textured import trace, with_depth, write
+from tests.diagnosis.textured import planted, trace, with_depth, write
 
 
 def around(count, distance=2.2):
@@ -29,3 +32,54 @@ def test_depth_all_around_an_object_is_compared_with_views_of_the_same_side(turn
     (check,) = findings.checks
     assert check.name == "depth of one view in another"
     assert check.value < 0.5
+
+
+def test_what_leaves_no_trace_is_said(tmp_path):
+    """Level cameras at one height see the same epipolar geometry whether y points up or down."""
+    angles = np.radians([-20.0, -8, 3, 15])
+    eyes = [(2.2 * np.sin(angle), -0.02, -2.2 * np.cos(angle)) for angle in angles]
+    scene = write(trace(eyes, [0.0] * 4), tmp_path)
+    for each in (scene, planted(scene, "y flipped")):
+        findings = examine_photographs(each).findings
+        assert findings.verdict == "good"
+        (remark,) = [remark for remark in findings.remarks if "no trace" in remark]
+        assert remark.endswith(": y flipped")
+    cause = examine_photographs(planted(scene, "OpenGL axes")).findings.cause
+    assert cause is not None
+    assert cause.name == "OpenGL axes"
+
+
+def test_rotations_alone_tell_inverted_poses(tmp_path):
+    """Right cameras in one place have no parallax, wrong ones do: its absence speaks against no correction."""
+    scene = write(trace([(0.3, 0.2, -2.2)] * 4, [0.0, 0.25, 0.5, 0.8]), tmp_path)
+    cause = examine_photographs(planted(scene, "poses inverted")).findings.cause
+    assert cause is not None
+    assert "poses inverted" in (
+        cause.name,
+        *cause.evidence.rpartition("cannot tell it from: ")[2].rstrip(")").split(", "),
+    )
+
+
+def checks(pairs, bad, error):
+    share = 100 * (1 - bad / pairs)
+    return [
+        Check("epipolar error of matched features", error, "px", 1.0, 5000, "matches"),
+        Check("pairs of photographs that agree", share, "%", 90.0, pairs, "pairs", at_least=True),
+    ]
+
+
+def test_one_pair_of_few_accuses_nothing():
+    assert not is_suspicious(checks(14, 1, 0.1))
+    assert not is_decisive(checks(14, 1, 0.1), checks(14, 0, 0.1))
+    assert is_suspicious(checks(40, 3, 0.1))
+    assert is_suspicious(checks(14, 2, 0.1))
+    assert is_decisive(checks(14, 2, 0.1), checks(14, 0, 0.1))
+
+
+def test_large_shifts_are_no_half_pixels():
+    assert is_half_a_pixel(Shift("matched features", 0.5, 0.6, 0.05, 0.05))
+    assert not is_large(Shift("matched features", 0.5, 0.6, 0.05, 0.05))
+    large = Shift("matched features", 0.05, 5.9, 0.02, 0.03)
+    assert is_large(large)
+    assert not is_half_a_pixel(large)
+    assert not is_large(large._replace(error_y=2.0))

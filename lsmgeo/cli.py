@@ -58,6 +58,7 @@ def info(path: str, out: str = "lsmgeo-info") -> int:
     from lsmgeo import data
     from lsmgeo.data.detect import detect
     from lsmgeo.diagnosis import examine
+    from lsmgeo.diagnosis.examination import with_gap
     from lsmgeo.diagnosis.photographs import examine_photographs
     from lsmgeo.diagnosis.pictures import draw_examination
     from lsmgeo.diagnosis.report import report
@@ -68,7 +69,7 @@ def info(path: str, out: str = "lsmgeo-info") -> int:
     drawn: dict[str, tuple[str, bytes]] = {}
     if isinstance(content, data.PosedImages):
         examination = examine_photographs(content)
-        findings = examination.findings
+        findings = with_gap(examination.findings, content)
         verdict = findings.verdict if findings.cause is None else findings.cause.name
         drawn = draw_examination(content, examination, f"{source.resolve().name}: {verdict}")
     else:
@@ -78,6 +79,8 @@ def info(path: str, out: str = "lsmgeo-info") -> int:
     print(f"{'time:':<18}{time.perf_counter() - start:.1f} s")
     for what, file in written.items():
         print(f"{what + ':':<28}{file.resolve()}")
+    if not written:
+        print(f"no pictures are drawn of {'voxels alone' if findings.kind == 'voxels' else 'a calibration'}")
     return {"good": 0, "bad": 1, "unknown": 3}[findings.verdict]
 
 

@@ -19,7 +19,8 @@ from lsmgeo.diagnosis.board_fitting import (
     rms,
     transfer_errors,
 )
-from lsmgeo.diagnosis.findings import Cause, Check, Findings
+from lsmgeo.diagnosis.findings import Cause, Check, Findings, Gap
+from lsmgeo.diagnosis.report import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -40,6 +41,9 @@ DOUBT, DOUBTS = 0.25, 4.0
 SCALES = tuple(sorted({a / b for a in (1, 2, 3, 4, 8) for b in (1, 2, 3, 4, 8)} - {1.0}))
 EXCHANGE = "The first lens is that of the second pictures: exchange lenses or pictures."
 OPENGL, FLIP = np.diag([1.0, -1.0, -1.0]), np.diag([1.0, -1.0, 1.0])
+
+# A first coefficient of distortion whose sign means something.
+LEAST_BENT = 0.02
 
 Pairs = list[tuple[np.ndarray, np.ndarray]]
 
@@ -89,12 +93,14 @@ def examine_calibration(calibration: Calibration, path: Path) -> Findings:
     report = _Report([], [], [], [])
     _state(calibration, report)
     if not any(calibration.pictures):
-        report.remarks.append(f"{path} names no picture of a board: nothing can be measured.")
-        return _concluded(report)
+        remedy = "List the pictures of the board in the file, or put them beside it in one folder, and name that."
+        return _concluded(report, Gap(f"{path} names no picture of a board", remedy))
     scene = _look(calibration, report)
     if not all(seen.found for seen in scene.seen):
-        report.remarks.append("A camera shows the board in no picture: nothing can be measured.")
-        return _concluded(report)
+        remedy = (
+            "Look whether the pictures show all of the board, sharp, and whether its count of inner corners is right."
+        )
+        return _concluded(report, _unseen(scene, remedy))
     pairs = _examine_pictures(scene, report)
     good = _examine_lenses(calibration, scene, report)
     if calibration.rig is not None and pairs:
@@ -103,7 +109,14 @@ def examine_calibration(calibration: Calibration, path: Path) -> Findings:
     return _concluded(report)
 
 
-def _concluded(report: _Report) -> Findings:
+def _unseen(scene: _Scene, remedy: str) -> Gap:
+    names = ("first camera", "second camera") if len(scene.seen) > 1 else ("camera",)
+    blind = [(name, side) for name, side in zip(names, scene.seen, strict=True) if not side.found]
+    told = " and ".join(f"{counted(len(side.corners), 'pictures')} of the {name}" for name, side in blind)
+    return Gap(f"no board was found in {told}", remedy)
+
+
+def _concluded(report: _Report, gap: Gap | None = None) -> Findings:
     # Of several mistakes the first: pictures come before lenses, and these before rigs, which are measured with them.
     cause = report.causes[0] if report.causes else None
     others = [
@@ -111,7 +124,7 @@ def _concluded(report: _Report) -> Findings:
         for other in report.causes[1:]
         if cause is not None and other.name != cause.name
     ]
-    return Findings(tuple(report.facts), tuple(report.checks), cause, (*report.remarks, *others))
+    return Findings(tuple(report.facts), tuple(report.checks), cause, (*report.remarks, *others), "calibration", gap)
 
 
 def _state(calibration: Calibration, report: _Report) -> None:
@@ -147,7 +160,8 @@ def _look(calibration: Calibration, report: _Report) -> _Scene:
     seen = tuple(look_at(side, corners) for side in paths)
     points = board_points(corners)
     for side, what in zip(seen, ("first camera", "second camera") if len(seen) > 1 else ("camera",), strict=True):
-        text = f"board found in {len(side.found)} of {len(side.corners)} pictures of {side.size[1]} x {side.size[0]}"
+        pictures = counted(len(side.corners), "pictures")
+        text = f"board found in {len(side.found)} of {pictures} of {side.size[1]} x {side.size[0]}"
         report.facts.append((what, text))
     anew = [calibrate(points, side, files[0]) for side, files in zip(seen, paths, strict=True)]
     fitted = [result for result in anew if result is not None]
@@ -166,11 +180,12 @@ def _pairs(scene: _Scene) -> Pairs:
 
 def _examine_pictures(scene: _Scene, report: _Report) -> Pairs:
     """Calibrate from scratch; the pairs of corners, which are those of the list unless it was shuffled."""
-    for error, side, lens in zip(scene.errors, scene.seen, scene.lenses, strict=False):
+    names = ("first camera anew", "second camera anew") if len(scene.seen) > 1 else ("calibrated anew",)
+    for name, error, side, lens in zip(names, scene.errors, scene.seen, scene.lenses, strict=False):
         what = "rms of a calibration from scratch"
         if len(scene.seen) == 1:
             report.checks.append(Check(what, error, "px", LIMIT, len(side.found) * len(scene.points), "corners"))
-        report.facts.append(("calibrated anew", f"{_lens_text(lens, side.size)}; rms {error:.3f} px"))
+        report.facts.append((name, f"{_lens_text(lens, side.size)}; rms {error:.3f} px"))
     pairs = _pairs(scene)
     if len(scene.lenses) < 2:
         return pairs
@@ -276,6 +291,9 @@ def _explain_lens(name: str, lens: CalibratedLens, stated: float, scene: _Scene,
             f"{scene.errors[side]:.3g} px; distortion in the corners is stated as {bent:.3g} px and measured as "
             f"{fitted:.3g} px"
         )
+        k1, other = lens.coefficients[0], scene.lenses[side].coefficients[0]
+        if lens.kind == scene.lenses[side].kind and k1 * other < 0 and min(abs(k1), abs(other)) > LEAST_BENT:
+            evidence += f"; the lens bends the other way, k1 is stated as {k1:+.3g} and measured as {other:+.3g}"
         remedy = (
             f"{lens.file.name} is not the calibration of these pictures: calibrate anew, or look for the right file."
         )

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lsmgeo.diagnosis.evidence import DepthMaps, Features, Outlines, StereoPair, principal_offsets
+from lsmgeo.diagnosis.findings import Gap
 from lsmgeo.diagnosis.limits import LIMITS
-from lsmgeo.diagnosis.matching import MAX_VIEWS
+from lsmgeo.diagnosis.matching import LEAST_VERIFIED, MAX_VIEWS, choose_views, count_features
+from lsmgeo.diagnosis.report import counted
 from lsmgeo.diagnosis.surfaces import relative_errors
 
 if TYPE_CHECKING:
@@ -18,10 +20,12 @@ if TYPE_CHECKING:
     from lsmgeo.diagnosis.evidence import Evidence
     from lsmgeo.diagnosis.geometry import Geometry, Hypothesis
 
-__all__ = ["describe_scene", "implausibilities"]
+__all__ = ["describe_scene", "find_gap", "implausibilities"]
 
 NARROWEST, WIDEST = 5.0, 170.0  # degrees
 MOST_ANISOTROPIC = 1.2
+# Photographs whose features are counted to say why none match.
+MOST_COUNTED = 8
 
 
 def describe_scene(
@@ -47,7 +51,7 @@ def describe_scene(
         facts += _facts_of(item, asis)
     if scene.points is not None:
         observed = sum(len(observation.points) for observation in scene.points.observations)
-        facts.append(("sparse points", f"{len(scene.points.positions)}, {observed} observations"))
+        facts.append(("sparse points", f"{len(scene.points.positions)}, {counted(observed, 'observations')}"))
     if scene.voxels is not None:
         occupancy = scene.voxels.occupancy
         text = f"{' x '.join(map(str, occupancy.shape))}, {100 * float(occupancy.float().mean()):.2g} % occupied"
@@ -59,7 +63,7 @@ def _facts_of(item: Evidence, asis: Hypothesis) -> list[tuple[str, str]]:
     if isinstance(item, Features):
         matches = item.matches
         seen = len(np.unique(np.concatenate([matches.first, matches.second])))
-        text = f"{len(matches.pair)} in {len(matches.first)} pairs of {seen} photographs"
+        text = f"{len(matches.pair)} in {counted(len(matches.first), 'pairs')} of {seen} photographs"
         return [("matched features", text)]
     if isinstance(item, Outlines):
         return [("outlines", f"{len(item.outlines)} seen whole")]
@@ -73,6 +77,37 @@ def _facts_of(item: Evidence, asis: Hypothesis) -> list[tuple[str, str]]:
                 text += f"; {100 * float(np.mean(np.abs(errors) < 0.02)):.3g} % within 2 % of another view's"
         return [("depth", text)]
     return []
+
+
+def find_gap(scene: PosedImages) -> Gap:
+    """Why nothing about photographs could be measured, and what would let it.
+
+    Raises:
+        DataError: a photograph is missing or damaged.
+    """
+    besides = "depth maps, sparse points, or cut-out photographs of a solid"
+    if len(scene) == 1:
+        remedy = "Add a photograph, with its camera, that sees the same from another place."
+        return Gap("the one photograph has no partner to be compared with", remedy)
+    views = choose_views(len(scene))
+    looked = views[np.unique(np.linspace(0, len(views) - 1, MOST_COUNTED).astype(int))]
+    counts = count_features(scene, looked)
+    among = counted(len(scene), "photographs")
+    if len(looked) < len(scene):
+        among = f"the {len(looked)} of {among} that were looked at"
+    if counts.max() == 0:
+        reason, remedy = f"no features were found in {among}", f"They are blank or blurred: add {besides}."
+    elif counts.max() < LEAST_VERIFIED:
+        reason = f"hardly any features, at most {counts.max()}, were found in {among}"
+        remedy = f"{LEAST_VERIFIED} that match are needed: take larger or sharper photographs, or add {besides}."
+    else:
+        among = counted(len(views), "photographs")
+        reason = f"no two of {among} have matched features (each has some {np.median(counts):.0f})"
+        remedy = (
+            "Add photographs in between, so that neighbours see the same thing from directions less than 30 degrees "
+            f"apart, or add {besides}."
+        )
+    return Gap(reason, remedy)
 
 
 def implausibilities(cameras: Geometry, sizes: np.ndarray) -> list[str]:
@@ -106,7 +141,13 @@ def field_of_view(cameras: Geometry, sizes: np.ndarray) -> np.ndarray:
 
 
 def _some(chosen: np.ndarray) -> str:
-    return "all photographs" if chosen.all() else f"{chosen.sum()} of {len(chosen)} photographs"
+    return (
+        "the photograph"
+        if len(chosen) == 1
+        else "all photographs"
+        if chosen.all()
+        else f"{chosen.sum()} of {len(chosen)} photographs"
+    )
 
 
 def _sizes(sizes: np.ndarray) -> str:

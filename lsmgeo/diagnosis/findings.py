@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-__all__ = ["Cause", "Check", "Findings"]
+__all__ = ["Cause", "Check", "Findings", "Gap"]
 
 
 class Check(NamedTuple):
@@ -48,6 +48,18 @@ class Cause(NamedTuple):
     remedy: str
 
 
+class Gap(NamedTuple):
+    """Why nothing could be measured.
+
+    Attributes:
+        reason: what is missing, such as "no mesh lies beside the voxels".
+        remedy: what to do for a verdict, one sentence.
+    """
+
+    reason: str
+    remedy: str
+
+
 class Findings(NamedTuple):
     """What an examination found.
 
@@ -56,12 +68,16 @@ class Findings(NamedTuple):
         checks: what was measured; empty where nothing can be.
         cause: the likely mistake, where one is found; a mistake may be found though all checks pass.
         remarks: what else a reader should know, such as views that disagree with the others.
+        kind: what was examined.
+        gap: why nothing could be measured, where nothing could.
     """
 
     facts: tuple[tuple[str, str], ...]
     checks: tuple[Check, ...]
     cause: Cause | None
     remarks: tuple[str, ...] = ()
+    kind: Literal["photographs", "calibration", "voxels"] = "photographs"
+    gap: Gap | None = None
 
     @property
     def verdict(self) -> Literal["good", "bad", "unknown"]:

@@ -11,7 +11,7 @@ from tqdm import tqdm
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
 
-__all__ = ["MAX_VIEWS", "Matches", "choose_views", "grey_picture", "match_features"]
+__all__ = ["MAX_VIEWS", "Matches", "choose_views", "count_features", "grey_picture", "match_features"]
 
 # Views that are looked at, at most; beyond, runs of neighbours are taken so that some of them overlap.
 MAX_VIEWS = 40
@@ -117,6 +117,15 @@ def match_features(scene: PosedImages, views: np.ndarray) -> Matches:
         np.concatenate([np.zeros((0, 2, 2)), *(pixels for _, _, pixels in pairs)]),
         features,
     )
+
+
+def count_features(scene: PosedImages, views: np.ndarray) -> np.ndarray:
+    """How many features each of some views has, (N,) int.
+
+    Raises:
+        DataError: a photograph is missing, damaged or not of its camera's size.
+    """
+    return np.array([len(_features(*grey_picture(scene, view, LONGEST_SIDE)).pixels) for view in views.tolist()], int)
 
 
 class _Features(NamedTuple):

@@ -9,12 +9,12 @@ import numpy as np
 if TYPE_CHECKING:
     from lsmgeo.diagnosis.findings import Check, Findings
 
-__all__ = ["report", "tell"]
+__all__ = ["counted", "report", "tell"]
 
 VERDICTS = {
-    "good": "good: cameras and what they saw belong together",
-    "bad": "BAD: cameras and what they saw do not belong together",
-    "unknown": "unknown: nothing here could be measured",
+    "photographs": ("cameras and what they saw belong together", "cameras and what they saw do not belong together"),
+    "calibration": ("lenses and pictures of the board agree", "lenses and pictures of the board do not agree"),
+    "voxels": ("the mesh and its voxels agree", "the mesh and its voxels do not agree"),
 }
 BEYOND = 1e8
 
@@ -38,11 +38,22 @@ def report(findings: Findings) -> str:
     if findings.checks:
         lines += ["", f"{'check':<42}{'measured':>9}{'limit':>14}", *(_line(check) for check in findings.checks)]
     lines += ["", *(f"{'remark:':<18}{remark}" for remark in findings.remarks)]
-    cause = findings.cause
-    if cause is None:
-        return "\n".join([*lines, f"{'verdict:':<18}{VERDICTS[findings.verdict]}"])
-    lines.append(f"{'verdict:':<18}BAD, the likely mistake: {cause.name}")
-    return "\n".join([*lines, f"{'because:':<18}{cause.evidence}", f"{'remedy:':<18}{cause.remedy}"])
+    return "\n".join([*lines, *(f"{name + ':':<18}{text}" for name, text in _concluded(findings))])
+
+
+def _concluded(findings: Findings) -> list[tuple[str, str]]:
+    cause, gap = findings.cause, findings.gap
+    good, bad = VERDICTS[findings.kind]
+    if cause is not None:
+        return [
+            ("verdict", f"BAD, the likely mistake: {cause.name}"),
+            ("because", cause.evidence),
+            ("remedy", cause.remedy),
+        ]
+    if findings.verdict != "unknown":
+        return [("verdict", f"good: {good}" if findings.verdict == "good" else f"BAD: {bad}")]
+    verdict = ("verdict", "unknown: nothing here could be measured")
+    return [verdict] if gap is None else [verdict, ("because", gap.reason), ("what to do", gap.remedy)]
 
 
 def _line(check: Check) -> str:
@@ -50,7 +61,20 @@ def _line(check: Check) -> str:
     unit = {"grey levels": "grey"}.get(check.unit, check.unit)
     value, limit = (f"{tell(number)} {unit}".rstrip() for number in (check.value, check.limit))
     state = "ok" if check.passed else "FAILED"
-    return f"{check.name:<42}{value:>9}  {sign} {limit:>8}  {state:<7} {check.measured} {check.of}".rstrip()
+    return f"{check.name:<42}{value:>9}  {sign} {limit:>8}  {state:<7} {counted(check.measured, check.of)}".rstrip()
+
+
+def counted(count: int, things: str) -> str:
+    """A number of things, in the singular where there is one.
+
+    Example:
+        >>> from lsmgeo.diagnosis.report import counted
+        >>> counted(2, "photographs"), counted(1, "photographs"), counted(1, "matches")
+        ('2 photographs', '1 photograph', '1 match')
+    """
+    if count == 1:
+        things = things.removesuffix("es" if things.endswith("ches") else "s")
+    return f"{count} {things}"
 
 
 def tell(value: float) -> str:

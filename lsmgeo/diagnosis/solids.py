@@ -10,7 +10,7 @@ import numpy as np
 
 from lsmgeo.data.binvox import binvox_files, is_binvox, read_binvox
 from lsmgeo.data.meshes import load_mesh
-from lsmgeo.diagnosis.findings import Cause, Check, Findings
+from lsmgeo.diagnosis.findings import Cause, Check, Findings, Gap
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
@@ -62,16 +62,19 @@ def examine_voxels(voxels: Voxels, path: str | Path) -> Findings:
         mesh_file = _find_mesh(path)
         mesh = None if mesh_file is None else load_mesh(mesh_file)
     except DataError as error:
-        return Findings(facts, (), None, (f"the mesh beside cannot be read: {error}",))
+        gap = Gap(f"the mesh beside cannot be read: {error}", "Mend that file, or put another mesh in its place.")
+        return Findings(facts, (), None, (), "voxels", gap)
     if mesh is None or mesh_file is None:
-        remark = "no mesh lies beside the voxels, so where they belong cannot be checked"
-        if _is_solid_file(path):
-            remark += "; those of 3D-R2N2 are centred on the origin whatever their header says (placement='centred')"
-        return Findings(facts, (), None, (remark,))
+        remark = "voxels of 3D-R2N2 are centred on the origin whatever their header says (placement='centred')"
+        gap = Gap(
+            "no mesh lies beside the voxels, so where they belong cannot be checked",
+            "Put the mesh that they were made from beside them, by the name model.obj (or .ply, .off, .stl, .glb).",
+        )
+        return Findings(facts, (), None, (remark,) if _is_solid_file(path) else (), "voxels", gap)
     samples = _surface_samples(mesh)
     facts += (("mesh", f"{mesh_file.name}, {len(mesh.faces):,} faces"), ("box of the mesh", _box(*mesh.bounds)))
     checks = _checks(placed, samples)
-    return Findings(facts, checks, _cause(placed, samples, path, checks[0].value))
+    return Findings(facts, checks, _cause(placed, samples, path, checks[0].value), kind="voxels")
 
 
 def _placed(voxels: Voxels) -> _Placed:

@@ -76,6 +76,8 @@ def test_nothing_measured_is_told_with_status_3(traced, tmp_path, capsys):
     status, printed = run(middlebury(blank, tmp_path / "scene", traced.E), tmp_path / "out", capsys)
     assert status == 3
     assert "unknown: nothing here could be measured" in printed.out
+    assert "because:          no features were found in 4 photographs" in printed.out
+    assert "what to do:       They are blank or blurred: add" in printed.out
     assert "check " not in printed.out
 
 
@@ -98,8 +100,19 @@ def test_what_is_no_photographs_goes_to_its_own_examination(tmp_path, capsys, mo
     header = b"#binvox 1\ndim 2 2 2\ntranslate 0 0 0\nscale 1\ndata\n"
     (tmp_path / "solid.binvox").write_bytes(header + bytes([1, 4, 0, 4]))
     status, printed = run(tmp_path / "solid.binvox", tmp_path / "out", capsys)
-    assert status in (0, 1, 3)
-    assert "verdict:" in printed.out
+    assert status == 3
+    assert "because:          no mesh lies beside the voxels" in printed.out
+    assert printed.out.splitlines()[-1] == "no pictures are drawn of voxels alone"
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_single_photograph_has_no_partner(tmp_path, capsys):
+    alone = trace(*on_an_arc(1))
+    status, printed = run(middlebury(alone, tmp_path / "scene", alone.E), tmp_path / "out", capsys)
+    assert status == 3
+    assert "the one photograph has no partner" in printed.out
+    assert "1 photographs" not in printed.out
+    assert (tmp_path / "out" / "cameras.png").exists()
 
 
 def test_a_report_without_checks_and_cause():

@@ -13,6 +13,7 @@ from lsmgeo import data
 from lsmgeo.data import Board, CalibratedLens, Calibration, Rig
 from lsmgeo.diagnosis.board_corners import board_points, find_corners
 from lsmgeo.diagnosis.boards import examine_calibration
+from lsmgeo.diagnosis.report import report
 
 ROOT = os.environ.get("LSMGEO_TEST_DATA")
 HERE = Path("rig.yml")
@@ -160,6 +161,15 @@ def test_another_lens_is_named(truth):
     bent = {name: replace(lens, coefficients=(0.6, -1.0, 0.0, 0.0)) for name, lens in truth.lenses.items()}
     findings = examine_calibration(replace(truth, lenses=bent), HERE)
     assert findings.cause.name == "lens of other pictures"
+    assert "the lens bends the other way, k1 is stated as +0.6 and measured as -0." in findings.cause.evidence
+
+
+def test_both_cameras_are_told_apart(truth):
+    findings = examine_calibration(truth, HERE)
+    names = [name for name, _ in findings.facts]
+    assert len(names) == len(set(names))
+    assert {"first camera anew", "second camera anew"} <= set(names)
+    assert "good: lenses and pictures of the board agree" in report(findings)
 
 
 def test_exchanged_lenses_are_named(truth):
@@ -204,10 +214,11 @@ def test_stated_poses_of_the_board_are_compared(truth):
 def test_what_cannot_be_measured_is_unknown(truth, tmp_path):
     findings = examine_calibration(replace(truth, pictures=()), HERE)
     assert (findings.verdict, findings.checks) == ("unknown", ())
-    assert "nothing can be measured" in findings.remarks[0]
+    assert "names no picture of a board" in findings.gap.reason
     Image.new("RGB", (320, 240)).save(tmp_path / "a.png")
     findings = examine_calibration(replace(truth, pictures=((tmp_path / "a.png",),)), HERE)
     assert findings.verdict == "unknown"
+    assert findings.gap.reason == "no board was found in 1 picture of the camera"
     few = replace(truth, pictures=tuple(side[:2] for side in truth.pictures))
     findings = examine_calibration(few, HERE)
     assert "Too few pictures" in findings.remarks[0]

@@ -125,12 +125,12 @@ def test_without_a_mesh_nothing_is_known(folder):
     (folder / "model.obj").write_text("no mesh")
     findings = examine_voxels(voxels, path)
     assert findings.verdict == "unknown"
-    assert "cannot be read" in findings.remarks[0]
+    assert "cannot be read" in findings.gap.reason
     for file in (folder / "model.obj", folder / "other.ply"):
         file.unlink()
     findings = examine_voxels(voxels, path)
     assert findings.verdict == "unknown"
-    assert "no mesh lies beside" in findings.remarks[0]
+    assert "no mesh lies beside" in findings.gap.reason
     assert "3D-R2N2" in findings.remarks[0]
 
 

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lsmgeo.diagnosis.camera_drawing import Content, draw_cameras, surface_of
 from lsmgeo.diagnosis.epipolar import sampson_distances
 from lsmgeo.diagnosis.evidence import DepthMaps, Features, Solids, StereoPair
 from lsmgeo.diagnosis.geometry import fundamental
-from lsmgeo.diagnosis.silhouettes import draw_solid, occupied_centers
+from lsmgeo.diagnosis.silhouettes import draw_solid
 from lsmgeo.diagnosis.surfaces import seen_errors, surface_points, warped
 
 if TYPE_CHECKING:
@@ -18,18 +19,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from lsmgeo.data import PosedImages
-    from lsmgeo.diagnosis.geometry import Geometry
     from lsmgeo.diagnosis.photographs import Examination
 
 __all__ = ["draw_examination"]
 
 DPI = 90
 MOST_POINTS, MOST_MATCHES = 4000, 12
-# Up to so many cameras have their numbers written beside them.
-MOST_NUMBERS, NUMBERS_APART = 100, 0.022
 LONGEST_SIDE = 900
-# Frusta are this long, as a part of the way to the nearest other camera and of the whole.
-FRUSTUM, FRUSTUM_OF_ALL, SHORTEST = 0.6, 0.12, 0.045
 
 
 def draw_examination(scene: PosedImages, examination: Examination, title: str) -> dict[str, tuple[str, bytes]]:
@@ -82,133 +78,27 @@ def _colours(count: int) -> np.ndarray:
 
 
 def _cameras(scene: PosedImages, examination: Examination, title: str) -> bytes:
-    """Cameras from above and from aside."""
+    """Cameras from above and from the side."""
     cameras = examination.hypothesis.photographs
-    content, colours = _content(scene, examination)
-    # Axes of the drawing: across, up, and towards the viewer who looks from above.
-    up = _up(cameras)
-    front = np.eye(3)[np.argmin(np.abs(up))]
-    across = np.cross(up, front)
-    across /= np.linalg.norm(across)
-    system = np.stack([across, np.cross(up, across), up])
     sizes = np.array([scene.size(view) for view in range(len(scene))])
     figure = _figure(14, 7.8, title)
-    figure.supxlabel("world units; thick: the upper side of the picture; dotted: the optical axis", fontsize=9)
-    views = (("from above", 90.0), ("from aside", 25.0))
-    for axes, (words, elevation) in zip(figure.subplots(1, 2), views, strict=True):
-        axes.set_title(f"{len(cameras.K)} cameras {words}")
-        angle = np.radians(elevation)
-        # Rows: right, up on the paper, and out of it.
-        tilt = np.array([[1, 0, 0], [0, np.sin(angle), np.cos(angle)], [0, -np.cos(angle), np.sin(angle)]])
-        _draw_cameras(axes, cameras, content, colours, tilt @ system, sizes)
+    draw_cameras(figure, cameras, _content(scene, examination), sizes, _colours(len(scene)))
     return _png(figure)
 
 
-def _up(cameras: Geometry) -> np.ndarray:
-    """The normal of the ring that cameras make around something, or else the mean of their own up."""
-    up = -cameras.R[:, 1].mean(0)
-    if np.linalg.norm(up) < 0.2:
-        up = -cameras.R[0, 1]
-    centers = cameras.centers
-    _, spread, axes = np.linalg.svd(centers - centers.mean(0), full_matrices=False)
-    if len(centers) > 3 and spread[2] < 0.3 * spread[1] and spread[1] > 0.3 * spread[0]:
-        up = axes[2] * (np.sign(axes[2] @ up) or 1.0)
-    return np.asarray(up / np.linalg.norm(up))
-
-
-def _content(scene: PosedImages, examination: Examination) -> tuple[np.ndarray, np.ndarray | str]:
-    """Points of what is seen, (N, 3), and their colours."""
-    points, colours = np.zeros((0, 3)), "0.45"
+def _content(scene: PosedImages, examination: Examination) -> Content:
+    """What there is to be seen: sparse points, voxels, or points of depth maps."""
     if scene.points is not None and len(scene.points.positions):
-        chosen = np.linspace(0, len(scene.points.positions) - 1, MOST_POINTS).astype(int)
-        chosen = np.unique(chosen)
-        return scene.points.positions[chosen], scene.points.colours[chosen] / 255.0
+        chosen = np.unique(np.linspace(0, len(scene.points.positions) - 1, MOST_POINTS).astype(int))
+        return Content(scene.points.positions[chosen], scene.points.colours[chosen] / 255.0)
     if scene.voxels is not None:
-        centers = occupied_centers(scene.voxels).centers
-        return centers[:: max(1, len(centers) // MOST_POINTS)], colours
+        return surface_of(scene.voxels)
+    points = np.zeros((0, 3))
     for item in examination.evidence:
         if isinstance(item, DepthMaps | StereoPair):
             each = [surface_points(item.surfaces, examination.hypothesis, view) for view in item.surfaces.views]
             points = np.concatenate(each)
-    return points[:: max(1, len(points) // MOST_POINTS)], colours
-
-
-def _draw_cameras(
-    axes: Axes,
-    cameras: Geometry,
-    content: np.ndarray,
-    colours: np.ndarray | str,
-    system: np.ndarray,
-    sizes: np.ndarray,
-) -> None:
-    from matplotlib.collections import LineCollection
-
-    centers = cameras.centers
-    middle = np.median(np.concatenate([centers, content]), axis=0)
-    length = _frustum_length(centers, content)
-    seen = (content - middle) @ system.T
-    if len(content):
-        order = np.argsort(seen[:, 2])
-        shown = colours if isinstance(colours, str) else colours[order]
-        axes.scatter(seen[order, 0], seen[order, 1], c=shown, s=3, linewidths=0)
-    placed = (centers - middle) @ system.T
-    places = [placed]
-    for view, colour in enumerate(_colours(len(centers))):
-        height, width = sizes[view]
-        corners = np.array(
-            [[-0.5, -0.5, 1], [width - 0.5, -0.5, 1], [width - 0.5, height - 0.5, 1], [-0.5, height - 0.5, 1]]
-        )
-        rays = np.concatenate([corners, [[(width - 1) / 2, (height - 1) / 2, 1]]]) @ np.linalg.inv(cameras.K[view]).T
-        rays = rays / np.abs(rays[:4, :2]).max() * 0.5 if np.abs(rays[:4, :2]).max() > 0.5 else rays
-        ends = (rays * length) @ np.linalg.inv(cameras.R[view]).T @ system.T + placed[view]
-        places.append(ends)
-        corner = ends[:4, :2]
-        lines = [np.stack([placed[view, :2], end]) for end in corner]
-        lines += [np.concatenate([corner, corner[:1]])]
-        axes.add_collection(LineCollection(lines, colors=[colour], linewidths=0.9, alpha=0.8))
-        # The optical axis, dashed, and the picture's upper side, thick.
-        along = np.stack([placed[view, :2], placed[view, :2] + 1.8 * (ends[4, :2] - placed[view, :2])])
-        axes.add_collection(LineCollection([along], colors=[colour], linewidths=0.7, linestyles="dotted"))
-        axes.add_collection(LineCollection([corner[:2]], colors=[colour], linewidths=2.4))
-    limits = [np.concatenate(places)[:, :2]]
-    if len(content):
-        limits.append(np.percentile(seen[:, :2], (2, 98), axis=0))
-    everything = np.concatenate(limits)
-    low, high = everything.min(0), everything.max(0)
-    span = float((high - low).max()) + 1e-12
-    margin = 0.1 * span
-    _number(axes, placed, length, span)
-    axes.set_xlim(low[0] - margin, high[0] + margin)
-    axes.set_ylim(low[1] - margin, high[1] + margin)
-    axes.set_aspect("equal")
-    axes.tick_params(labelsize=7)
-
-
-def _number(axes: Axes, placed: np.ndarray, length: float, span: float) -> None:
-    """Numbers outside the ring that cameras often make; of very many, every few."""
-    step = int(np.ceil(len(placed) / MOST_NUMBERS))
-    written: list[np.ndarray] = []
-    middle = placed[:, :2].mean(0)
-    for view in range(0, len(placed), step):
-        away = placed[view, :2] - middle
-        away = away / max(float(np.linalg.norm(away)), 1e-12)
-        place = placed[view, :2] + 0.35 * length * away
-        # Numbers on top of each other say less than one.
-        if all(np.abs((place - other) / span).max() > NUMBERS_APART for other in written):
-            axes.text(float(place[0]), float(place[1]), str(view), fontsize=8, ha="center", va="center")
-            written.append(place)
-
-
-def _frustum_length(centers: np.ndarray, content: np.ndarray) -> float:
-    """So long that neighbours hardly overlap and all are seen."""
-    everything = np.concatenate([centers, content])
-    low, high = np.percentile(everything, (2, 98), axis=0)
-    whole = float(np.linalg.norm(high - low))
-    if len(centers) < 2:
-        return max(FRUSTUM_OF_ALL * whole, 1e-9) if whole > 0 else 1.0
-    apart = np.linalg.norm(centers[:, None] - centers, axis=2) + np.where(np.eye(len(centers), dtype=bool), np.inf, 0)
-    near = float(np.median(apart.min(1)))
-    return float(np.clip(FRUSTUM * near, SHORTEST * whole, FRUSTUM_OF_ALL * whole)) or 1.0
+    return Content(points[:: max(1, len(points) // MOST_POINTS)])
 
 
 def _shown(scene: PosedImages, view: int) -> tuple[np.ndarray, float]:

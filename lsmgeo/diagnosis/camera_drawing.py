@@ -77,13 +77,15 @@ def draw_cameras(figure: Figure, cameras: Geometry, content: Content, sizes: np.
     words = f"thick: the upper side of the picture; dotted: the optical axis; {told}"
     figure.supxlabel(words, fontsize=9)
     panels = list(zip(figure.subplots(1, 2), (above, aside), ("from above", "from the side"), strict=True))
-    length = _frustum_length(cameras.centers, content.points)
+    length, meeting = _frustum_length(cameras.centers, content.points), _meeting(cameras)
     for axes, view, name in panels:
         axes.set_title(f"{counted(len(cameras.K), 'cameras')} {name}")
         places = _draw_frusta(axes, cameras, view, sizes, colours, length)
         seen = view.placed(content.points)[:, :2]
         if len(seen):
             places = np.concatenate([places, np.percentile(seen, (0, 100) if content.cell else (2, 98), axis=0)])
+        if meeting is not None:
+            places = np.concatenate([places, view.placed(meeting)[None, :2]])
         low, high = places.min(0), places.max(0)
         margin = 0.1 * float((high - low).max()) + 1e-12
         axes.set_xlim(low[0] - margin, high[0] + margin)
@@ -91,7 +93,7 @@ def draw_cameras(figure: Figure, cameras: Geometry, content: Content, sizes: np.
         axes.set_aspect("equal")
         axes.tick_params(labelsize=7)
         _name_axes(axes, view)
-        _mark(axes, cameras, view)
+        _mark(axes, meeting, view)
     # Sizes of voxels and places of numbers are told on paper, whose scale is known when all is laid out.
     figure.draw_without_rendering()
     for axes, view, _ in panels:
@@ -169,9 +171,8 @@ def _draw_frusta(
     return np.concatenate(places)
 
 
-def _mark(axes: Axes, cameras: Geometry, view: _View) -> None:
+def _mark(axes: Axes, meeting: np.ndarray | None, view: _View) -> None:
     """The world's origin, and the point where the optical axes meet, where they are in the drawing."""
-    meeting = _meeting(cameras)
     marks = [("+", "origin of the world", np.zeros(3))]
     marks += [] if meeting is None else [("o", "where the optical axes meet", meeting)]
     for sign, name, point in marks:

@@ -43,6 +43,7 @@ __all__ = [
 
 LEAST_WITH_PARALLAX = 30
 LEAST_OBSERVATIONS = 20
+LEAST_OUTLINE_PAIRS = 3
 LEAST_PAIRS = 3
 # Matches of a pair, and pairs of outlines, that a hypothesis is tried on.
 MATCHES_TRIED = 100
@@ -221,7 +222,8 @@ class Outlines:
         self.limit = pixel_limit(sizes)
 
     def __bool__(self) -> bool:
-        return len(self.pairs) > 0
+        # The two tangents of a single pair agree too often by chance.
+        return len(self.pairs) >= LEAST_OUTLINE_PAIRS
 
     def measure(self, hypothesis: Hypothesis) -> list[Check]:
         """Median distance between tangents."""

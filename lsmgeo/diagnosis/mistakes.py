@@ -155,7 +155,9 @@ def focal_mistakes(asis: Hypothesis, scales: Iterable[float]) -> list[Candidate]
     found = []
     for scale in scales:
         factor = np.array([[scale, scale, 1.0], [scale, scale, 1.0], [1.0, 1.0, 1.0]])
-        remedy = f"The focal lengths are off by a factor of {scale:.4g}: check angles, units and which side is meant."
+        remedy = f"The focal lengths are off by a factor of {scale:.4g}: check angles, units and which side is meant"
+        # Both bend the same rays; far from 1, no principal point would do it.
+        remedy += "." if abs(np.log(scale)) > 0.2 else "; or it is the principal points that are off."
         changed = _both(asis, partial(_multiplied, factor=factor))
         found.append(Candidate("focal length off", f"with focal lengths times {scale:.4g}", remedy, changed))
     return found

@@ -58,6 +58,10 @@ def order_mistakes(
         # Depth and points may have gone with the photographs, or stayed with the cameras.
         found.append(Candidate(name, corrected, remedy, alone._replace(beside=asis.beside.taken(order))))
         found.append(Candidate(name, corrected, remedy, alone))
+        if np.ptp(asis.photographs.K, axis=0).any():
+            # Or every photograph has kept its own K, and the poses alone are in another order.
+            kept = asis._replace(photographs=photographs._replace(K=asis.photographs.K))
+            found.append(Candidate(name, corrected, remedy, kept))
     return found
 
 

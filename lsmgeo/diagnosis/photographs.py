@@ -29,6 +29,8 @@ __all__ = ["Examination", "examine_photographs"]
 MOST_OFF = 1 / 3
 LISTED = 5
 SHUFFLED = "frames shuffled"
+# A measurement of right cameras stays this far below its limit, as a multiple of it.
+WELL = 0.5
 LEAST_PAIRS, LEAST_OBSERVED = 2, 10
 
 
@@ -66,8 +68,7 @@ def examine_photographs(scene: PosedImages) -> Examination:
     with_views, off = _with_views(scene, checks, evidence, asis)
     if is_suspicious(checks):
         explanation, tried = explain(asis, evidence, scene.names, sizes, views)
-        # Where all but a few photographs agree, nothing that concerns every camera is wrong.
-        if explanation is not None and not (passed and off is not None and explanation.candidate.name != SHUFFLED):
+        if explanation is not None and (off is None or _beats_single_views(explanation, passed=passed)):
             cause = _told(explanation)
     if cause is None:
         checks, cause = with_views, off
@@ -89,6 +90,15 @@ def examine_photographs(scene: PosedImages) -> Examination:
     facts = describe_scene(scene, views, evidence, asis, sizes)
     findings = Findings(tuple(facts), tuple(checks), cause, tuple(remarks))
     return Examination(findings, tuple(evidence), asis, views)
+
+
+def _beats_single_views(explanation: Explanation, *, passed: bool) -> bool:
+    """Whether a mistake is likelier than single wrong views, though all but a few photographs agree."""
+    if explanation.candidate.name == SHUFFLED:
+        # An order that is right mends everything; another camera that suits a wrong view a little mends little.
+        return all(badness(check) <= WELL for check in explanation.after)
+    # What concerns every camera is not wrong where most agree.
+    return not passed
 
 
 def _told(explanation: Explanation) -> Cause:
@@ -161,7 +171,7 @@ def _off_by_features(features: Features, asis: Hypothesis) -> tuple[set[int], se
     # Where most pairs are bad, no single view is.
     if not np.median(medians) <= features.limit:
         return set(), set()
-    bad = medians > LIMITS["view"] * features.limit
+    bad = medians > _standing_out(medians, features.limit)
     left = np.ones(len(first), bool)
     off: set[int] = set()
     while (bad & left).any():
@@ -180,6 +190,11 @@ def _off_by_features(features: Features, asis: Hypothesis) -> tuple[set[int], se
     return off, {int(view) for view in np.flatnonzero(counts >= LEAST_PAIRS)}
 
 
+def _standing_out(medians: np.ndarray, limit: float) -> float:
+    """From where on a view or a pair is worse than its fellows: what all share is no single view's."""
+    return float(np.clip(LIMITS["view"] * np.median(medians), limit, LIMITS["view"] * limit))
+
+
 def _off_by_points(points: Points, asis: Hypothesis) -> tuple[set[int], set[int]]:
     errors, _, views = reprojection_errors(points.points, asis.beside)
     known = [view for view in np.unique(views) if (views == view).sum() >= LEAST_OBSERVED]
@@ -188,5 +203,5 @@ def _off_by_points(points: Points, asis: Hypothesis) -> tuple[set[int], set[int]
         return set(), set()
     if not np.median(medians) <= points.limit:
         return set(), set()
-    limit = LIMITS["view"] * points.limit
+    limit = _standing_out(medians, points.limit)
     return {int(view) for view, median in zip(known, medians, strict=True) if median > limit}, {int(v) for v in known}

@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 from lsmgeo.diagnosis import evidence, examine
+from lsmgeo.diagnosis.geometry import as_they_are
 from lsmgeo.diagnosis.matching import match_features
+from lsmgeo.diagnosis.orders import order_mistakes
 from lsmgeo.diagnosis.photographs import examine_photographs
 from lsmgeo.errors import DataError
 from tests.diagnosis.textured import (
@@ -134,16 +137,29 @@ def test_orders_are_named(photographs, order, words):
     assert words in cause.remedy
 
 
-def test_one_view_that_is_off_is_named(photographs):
+@pytest.mark.parametrize(("axis", "degrees"), [(1, 4.0), (2, 2.0), (0, 1.0)])
+def test_one_view_that_is_off_is_named(photographs, axis, degrees):
     _, E = matrices(photographs)
-    angle = np.radians(4.0)
-    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    # Some pixels: more than a view of its own that is right is ever off, less than what fails a pair.
+    turn, _ = cv2.Rodrigues(np.radians(degrees) * np.eye(3)[axis])
     E[3, :3] = turn @ E[3, :3]
     findings = examine_photographs(with_cameras(photographs, E=E)).findings
     assert findings.verdict == "bad"
     assert findings.cause.name == "some views are off"
     assert "frame_3.png" in findings.cause.evidence
     assert "frame_2.png" not in findings.cause.evidence
+
+
+def test_poses_may_be_shuffled_while_every_photograph_keeps_its_own_intrinsics(photographs):
+    K, _ = matrices(photographs)
+    own = K * np.linspace(1.0, 1.1, len(K))[:, None, None] ** np.array([[1, 1, 0], [1, 1, 0], [0, 0, 0]])
+    asis = as_they_are(with_cameras(photographs, K=own))
+    found = [
+        candidate.hypothesis.photographs for candidate in order_mistakes(asis, photographs.names, [], np.arange(7))
+    ]
+    backwards = [cameras for cameras in found if np.array_equal(cameras.t, asis.photographs.t[::-1])]
+    assert any(np.array_equal(cameras.K, own) for cameras in backwards)
+    assert any(np.array_equal(cameras.K, own[::-1]) for cameras in backwards)
 
 
 def test_what_no_mistake_explains_is_said(photographs):

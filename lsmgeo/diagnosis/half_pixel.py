@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from lsmgeo.diagnosis.evidence import Evidence
     from lsmgeo.diagnosis.geometry import Geometry
 
-__all__ = ["Shift", "find_shifts", "is_certain", "is_half_a_pixel", "is_large"]
+__all__ = ["Shift", "find_shifts", "is_certain", "is_half_a_pixel", "is_large", "nearer_half"]
 
 STEP = 0.25  # px, for derivatives
 ITERATIONS = 20
@@ -81,14 +81,24 @@ def is_half_a_pixel(shift: Shift) -> bool:
         >>> is_half_a_pixel(Shift("matched features", 0.1, 5.9, 0.05, 0.05))
         False
     """
-    errors = np.array([shift.error_x, shift.error_y])
-    found = np.array([shift.x, shift.y])
+    left = min(_distance(shift, 0.5), _distance(shift, -0.5))
+    return _distance(shift, 0.0) - left >= LEAST_GAIN and left <= MOST_LEFT and is_certain(shift)
 
-    def distance(expected: float) -> float:
-        return float(((found - expected) ** 2 / (errors**2 + SYSTEMATIC**2)).sum())
 
-    left = min(distance(0.5), distance(-0.5))
-    return distance(0.0) - left >= LEAST_GAIN and left <= MOST_LEFT and is_certain(shift)
+def nearer_half(shift: Shift) -> float:
+    """Which of the two half pixels along both axes a shift is nearer to, as certain as each axis is.
+
+    Example:
+        >>> from lsmgeo.diagnosis.half_pixel import Shift, nearer_half
+        >>> nearer_half(Shift("matched features", -0.1, 0.5, 0.3, 0.05))
+        0.5
+    """
+    return 0.5 if _distance(shift, 0.5) <= _distance(shift, -0.5) else -0.5
+
+
+def _distance(shift: Shift, expected: float) -> float:
+    found, errors = np.array([shift.x, shift.y]), np.array([shift.error_x, shift.error_y])
+    return float(((found - expected) ** 2 / (errors**2 + SYSTEMATIC**2)).sum())
 
 
 def is_large(shift: Shift) -> bool:

@@ -11,7 +11,7 @@ from lsmgeo.diagnosis.explain import explain, invisible_mistakes, is_suspicious
 from lsmgeo.diagnosis.facts import describe_scene, implausibilities
 from lsmgeo.diagnosis.findings import Cause, Check, Findings
 from lsmgeo.diagnosis.geometry import Hypothesis, as_they_are
-from lsmgeo.diagnosis.half_pixel import Shift, find_shifts, is_certain, is_half_a_pixel, is_large
+from lsmgeo.diagnosis.half_pixel import Shift, find_shifts, is_certain, is_half_a_pixel, is_large, nearer_half
 from lsmgeo.diagnosis.limits import LIMITS, badness
 from lsmgeo.diagnosis.matching import choose_views
 from lsmgeo.diagnosis.report import tell
@@ -71,10 +71,13 @@ def examine_photographs(scene: PosedImages) -> Examination:
         if explanation is not None and (off is None or _beats_single_views(explanation, passed=passed)):
             cause = _told(explanation)
     if cause is None:
-        checks, cause = with_views, off
-    if cause is None:
         shifts = find_shifts(evidence, asis.photographs)
-        cause = _half_a_pixel(shifts)
+        half, mended = _half_a_pixel(shifts, asis)
+        # Half a pixel may put one view beyond what is allowed first; without it no view is off.
+        if half is not None and (off is None or _with_views(scene, checks, evidence, mended)[1] is None):
+            checks, cause = (with_views if off is None else checks), half
+        else:
+            checks, cause = with_views, off
         if cause is None and not passed:
             remarks.append(f"no single mistake explains this; tried were {', '.join(tried)}, half a pixel")
         elif cause is None and checks and not any(is_certain(shift) for shift in shifts):
@@ -116,24 +119,27 @@ def _told(explanation: Explanation) -> Cause:
     return Cause(candidate.name, evidence, candidate.remedy)
 
 
-def _half_a_pixel(shifts: Sequence[Shift]) -> Cause | None:
+def _half_a_pixel(shifts: Sequence[Shift], asis: Hypothesis) -> tuple[Cause | None, Hypothesis]:
+    """Half a pixel where most of what is certain tells it, and the cameras without it."""
     told = [shift for shift in shifts if is_half_a_pixel(shift)]
     # Evidence that is as certain and says otherwise speaks against it.
     against = [shift for shift in shifts if is_certain(shift) and not is_half_a_pixel(shift)]
     if len(told) <= len(against):
-        return None
+        return None, asis
     best = min(told, key=lambda shift: max(shift.error_x, shift.error_y))
-    large = best.x > 0
+    step = nearer_half(best)
+    large, sign = step > 0, np.sign(step)
+    mended = asis._replace(photographs=asis.photographs.shifted(-step, -step), beside=asis.beside.shifted(-step, -step))
     evidence = (
-        f"the {best.told_by} put the principal points {abs(best.x):.2f} +- {best.error_x:.2f} px (x) and "
-        f"{abs(best.y):.2f} +- {best.error_y:.2f} px (y) too {'far' if large else 'near'}"
+        f"the {best.told_by} put the principal points {best.x * sign:.2f} +- {best.error_x:.2f} px (x) and "
+        f"{best.y * sign:.2f} +- {best.error_y:.2f} px (y) too {'far' if large else 'near'}"
     )
     remedy = (
         "cx and cy count pixels from a corner where from the centre of the first pixel is meant: subtract 0.5."
         if large
         else "0.5 was subtracted from cx and cy once too often: add 0.5."
     )
-    return Cause("half a pixel", evidence, remedy)
+    return Cause("half a pixel", evidence, remedy), mended
 
 
 def _with_views(

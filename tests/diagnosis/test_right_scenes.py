@@ -7,7 +7,7 @@ import pytest
 
 from lsmgeo.diagnosis.explain import is_decisive, is_suspicious
 from lsmgeo.diagnosis.findings import Check
-from lsmgeo.diagnosis.half_pixel import Shift, is_half_a_pixel, is_large
+from lsmgeo.diagnosis.half_pixel import Shift, is_half_a_pixel, is_large, nearer_half
 from lsmgeo.diagnosis.photographs import examine_photographs
 from tests.diagnosis.textured import planted, trace, with_depth, write
 
@@ -83,3 +83,8 @@ def test_large_shifts_are_no_half_pixels():
     assert is_large(large)
     assert not is_half_a_pixel(large)
     assert not is_large(large._replace(error_y=2.0))
+
+
+def test_the_side_is_told_by_the_axis_that_is_certain():
+    assert nearer_half(Shift("matched features", -0.1, 0.5, 0.3, 0.05)) == 0.5
+    assert nearer_half(Shift("matched features", -0.5, 0.1, 0.05, 0.3)) == -0.5

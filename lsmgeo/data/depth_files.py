@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,11 +18,12 @@ if TYPE_CHECKING:
 __all__ = ["DepthFile", "DepthPng"]
 
 
-class DepthFile:
+class DepthFile(ABC):
     """Something that reads the depth of one photograph."""
 
     path: Path
 
+    @abstractmethod
     def read(self, size: tuple[int, int]) -> np.ndarray:
         """(H, W) float32 camera z in world units, 0 where there is none.
 
@@ -31,7 +33,6 @@ class DepthFile:
         Raises:
             DataError: the file is missing, damaged, or of another size.
         """
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -65,7 +66,7 @@ def read_splits(path: str | Path) -> Splits:
 
 
 @dataclass(frozen=True)
-class ObjectTree:
+class ObjectTree(ABC):
     """Objects below a folder, in the order of their paths, with the views and voxels that they came with.
 
     Attributes:
@@ -134,13 +135,13 @@ class ObjectTree:
         occupancy = grids[0] if grids else None
         return Rendered(sample._replace(occupancy=occupancy, name=key), grids[1:], split)
 
+    @abstractmethod
     def _files(self, folder: Path) -> list[Path]:
         """What an object is made from, sorted."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _read(self, index: int, recipe: Recipe) -> tuple[Sample, tuple[torch.Tensor, ...]]:
         """The views, and the occupancy of each resolution of the recipe."""
-        raise NotImplementedError
 
 
 def _key(name: str) -> str:

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad, unfold
+from torch.nn.functional import pad, unfold
 from tqdm import tqdm
 
-from lsmgeo import functional
-from lsmgeo.cameras import CameraTensors, resize
-from lsmgeo.classical.patches import patch_features, patch_frames
+from lsmgeo._checks import check_float, check_whole
+from lsmgeo.cameras.tensors import Cameras
+from lsmgeo.classical.matching import UNRELATED, aggregate_views, matching_costs_slabs
+from lsmgeo.classical.winners import Winners
 from lsmgeo.errors import OptionError
-from lsmgeo.grids import FrustumGrid
 
 __all__ = ["DepthMap", "kept", "slab_planes", "sweep"]
 
-UNRELATED = 1.0
-# A second minimum counts against the first only where it is another place, not the noise around the same one.
-SAME_PLANES = 2.5
-# How many arrays of each kind are alive at once at the worst moment (measured), and what the libraries take besides.
-LIVE_SLABS = 8
-LIVE_FEATURES = 4
-LIVE_IMAGES = 16
+# How many arrays of each kind are alive at once at the worst moment, and what the libraries take besides.
+LIVE_COSTS = 8
+LIVE_IMAGES = 40
 OVERHEAD = 128 << 20
 
 
@@ -33,16 +30,16 @@ class DepthMap(NamedTuple):
 
     depth: Tensor  # (h, w) camera z, world units, 0 where no plane wins
     confidence: Tensor  # (h, w) in [0, 1]
-    cost: Tensor  # (h, w), 1 - mean correlation between the views: 0 is perfect, 1 unrelated
+    cost: Tensor  # (h, w), the winner's matching cost: 0 is perfect, 1 unrelated
     planes: Tensor  # (h, w) fractional index of the winning plane, -1 where none
 
 
-def slab_planes(views: int, channels: int, size: tuple[int, int], memory: int) -> int:
+def slab_planes(neighbours: int, channels: int, size: tuple[int, int], memory: int) -> int:
     """Planes that a slab may have within a memory bound.
 
     Args:
-        views: V.
-        channels: C of the features.
+        neighbours: V - 1.
+        channels: C of what is warped.
         size: (h, w) of the maps.
         memory: bytes that the sweep may add to the process.
 
@@ -50,84 +47,87 @@ def slab_planes(views: int, channels: int, size: tuple[int, int], memory: int) -
         OptionError: not even one plane fits.
     """
     image = 4 * size[0] * size[1]
-    fixed = OVERHEAD + (LIVE_FEATURES * views * channels + LIVE_IMAGES) * image
-    plane = LIVE_SLABS * channels * image
+    fixed = OVERHEAD + ((neighbours + 1) * (channels + 1) + LIVE_IMAGES) * image
+    plane = (2 * channels + LIVE_COSTS) * neighbours * image
     if memory < fixed + plane:
         need = -(-(fixed + plane) // 2**20)
         raise OptionError(
-            f"memory must be at least {need} MiB for {views} views of {size[1]} x {size[0]}; got {memory >> 20} MiB"
+            f"memory must be at least {need} MiB for {neighbours + 1} views of {size[1]} x {size[0]}; "
+            f"got {memory >> 20} MiB"
         )
     return int((memory - fixed) // plane)
 
 
 def sweep(
     images: Tensor,
-    cameras: CameraTensors,
+    cameras: Cameras,
     depths: Tensor,
     *,
-    window: int = 3,
-    aggregate: int = 5,
-    min_views: int = 3,
+    score: str = "zncc",
+    window: int = 5,
+    best: int | None = None,
+    min_views: int = 1,
+    cost_filter: Callable[[Tensor], Tensor] | None = None,
     noise: float = 2 / 255,
     memory: int = 1 << 30,
     progress: bool = False,
 ) -> DepthMap:
     """Depth of the first view by sweeping planes through its frustum.
 
-    Every site of the frustum takes the patch features of all views; their variance is a matching cost (see
-    `lsmgeo.classical.patches.patch_features`), averaged over ``aggregate`` x ``aggregate`` pixels. Along a ray the
-    lowest local minimum wins, among sites that at least ``min_views`` views see, and a parabola through it and its
-    neighbours places it between planes. Planes pass in slabs and only the running winners are kept. (Collins, "A
-    space-sweep approach to true multi-image matching", CVPR 1996.)
+    At every site the `best` matching of the neighbours that see it are averaged (see
+    `lsmgeo.classical.matching_costs` and `lsmgeo.classical.aggregate_views`). Along a ray the lowest local minimum
+    wins, and a parabola through it and its neighbours in inverse depth places it between planes. Planes pass in slabs
+    and only the running winners are kept. (Collins, "A space-sweep approach to true multi-image matching", CVPR 1996.)
 
     Convention:
         Depth is camera z of the first view. Integer pixel centres.
 
     Args:
-        images: (V, 3, h, w) RGB in [0, 1], the reference first.
+        images: (V, C, h, w), the reference first, V at least 2: RGB or grey in [0, 1], or features.
         cameras: leading shape (V,), of images resized to (h, w) or of the originals, which may differ in size.
-        depths: (P,) ascending, P >= 3.
-        window: side of the patches.
-        aggregate: side of the square over which costs are averaged, odd.
-        min_views: least number of views that must see a site, the reference included.
-        noise: standard deviation of luminance that counts as no texture.
+        depths: (P,) ascending, P >= 3; see `lsmgeo.classical.sweep_planes`.
+        score: "zncc", "sad", "census" or "cosine".
+        window: side of the patches, odd.
+        best: neighbours averaged at a site, by default half of them, rounded up.
+        min_views: least number of neighbours that must see a site, the reference not included.
+        cost_filter: takes costs (d, h, w) float32 of some planes and gives filtered ones, plane by plane.
+        noise: standard deviation of the images' values that counts as no texture.
         memory: bound in bytes on what the sweep adds to the process, from which the size of a slab follows.
         progress: whether to show a progress bar (on a terminal).
 
     Returns:
-        `DepthMap` at (h, w).
+        `DepthMap` at (h, w). The confidence is ``max(0, 1 - cost)`` times the root of the uniqueness (how far the
+        second-lowest minimum elsewhere is above the lowest) times the fraction of near pixels whose planes agree.
 
     Raises:
         OptionError: too few planes or views, or a memory bound too small for one plane.
         ShapeError, CameraError, GridError: as `lsmgeo.functional.unproject`.
     """
-    views, _, height, width = images.shape
-    if depths.shape[-1] < 3:
-        raise OptionError(f"sweep: depths must hold at least 3 planes; got {depths.shape[-1]}")
-    if not 2 <= min_views <= views:
-        raise OptionError(f"sweep: min_views must lie in 2..{views}, the number of views; got {min_views}")
-    # Patches take their steps in pixels of the images at hand, and every view may have been resized by its own factors.
-    cameras = resize(cameras, height, width)
-    reference = CameraTensors(*(torch.as_tensor(value)[0] for value in cameras))
-    grid = FrustumGrid(reference, depths, (height, width))
-    middle = float((depths[0] * depths[-1]).sqrt())
-    slab = slab_planes(views, window * window + views, (height, width), memory)
+    check_float("sweep", "images", images, "(V, C, h, w)", rank=4)
+    check_float("sweep", "depths", depths, "(P,)", rank=1)
+    views, channels, height, width = images.shape
+    if depths.shape[0] < 3:
+        raise OptionError(f"sweep: depths must hold at least 3 planes; got {depths.shape[0]}")
+    neighbours = max(views - 1, 1)
+    min_views = check_whole("sweep", "min_views", min_views, 1, neighbours)
+    slab = slab_planes(neighbours, channels if score in ("sad", "cosine") else 1, (height, width), memory)
     with torch.no_grad():
-        features = patch_features(images, patch_frames(cameras, middle), window=window, noise=noise)
-        winners = _Winners(height, width)
-        slabs = functional.unproject_slabs(
-            features[None], cameras, grid, slab, reduce="variance", padding_mode="border"
-        )
-        with tqdm(total=depths.shape[-1], desc="sweep", unit="plane", disable=None if progress else True) as bar:
-            for _, variance, visible in slabs:
-                count = visible[0].sum(0)  # (d, h, w)
-                cost = variance[0].sum(0) * (count / (count - 1).clamp_min(1))
-                cost = torch.where(count >= min_views, cost, UNRELATED)
-                cost = _box(cost, aggregate)
+        winners = Winners(depths, (height, width), UNRELATED)
+        slabs = matching_costs_slabs(images, cameras, depths, slab, score=score, window=window, noise=noise)
+        with tqdm(total=len(depths), desc="sweep", unit="plane", disable=None if progress else True) as bar:
+            for _, (costs, visible) in slabs:
+                cost, count = aggregate_views(costs, visible, best=best, min_views=min_views)
+                del costs, visible
+                cost = cost.float()
+                if cost_filter is not None:
+                    cost = cost_filter(cost)
                 for plane_cost, plane_count in zip(cost, count, strict=True):
                     winners.push(plane_cost, plane_count >= min_views)
                 bar.update(len(cost))
-        return winners.finish(depths)
+        correlation = (1 - winners.best).clamp(0, 1)
+        confidence = correlation * winners.uniqueness().sqrt() * _agreement(winners.place)
+        confidence = torch.where(winners.place >= 0, confidence, 0.0)
+        return DepthMap(winners.depth(), confidence, winners.best.clamp_max(UNRELATED), winners.place)
 
 
 def kept(depth_map: DepthMap, density: float, least: float = 0.0, specks: int = 0) -> Tensor:
@@ -174,57 +174,6 @@ def _without_specks(mask: Tensor, planes: Tensor, least: int) -> Tensor:
     labels = torch.where(mask, (planes.clamp(0, 4000) + 1) * steps, 0.0).to(torch.int16).numpy()
     cv2.filterSpeckles(labels, 0, least - 1, 2 * steps)
     return mask & torch.from_numpy(labels > 0)
-
-
-class _Winners:
-    """The lowest and second-lowest local minimum of a cost along every ray, from planes that come one by one."""
-
-    def __init__(self, height: int, width: int):
-        self.before: list[tuple[Tensor, Tensor]] = []
-        self.count = 0
-        self.best = torch.full((height, width), 2 * UNRELATED)
-        self.second = torch.full((height, width), UNRELATED)
-        self.place = torch.full((height, width), -1.0)
-
-    def push(self, cost: Tensor, seen: Tensor) -> None:
-        """Take the next plane's cost (h, w) and where enough views see it."""
-        self.before.append((cost.clone(), seen))
-        self.count += 1
-        if len(self.before) < 3:
-            return
-        (previous, _), (middle, usable), (following, _) = self.before
-        self.before.pop(0)
-        is_minimum = usable & (middle <= previous) & (middle < following)
-        curvature = (previous - 2 * middle + following).clamp_min(1e-9)
-        place = self.count - 2 + (0.5 * (previous - following) / curvature).clamp(-0.5, 0.5)
-        elsewhere = (place - self.place > SAME_PLANES) | (self.place < 0)
-        better = is_minimum & (middle < self.best)
-        loser = torch.where(better, self.best, torch.where(is_minimum, middle, UNRELATED)).clamp_max(UNRELATED)
-        # A better minimum beside the old one replaces it; elsewhere it demotes the old one.
-        self.second = torch.where(
-            better,
-            torch.where(elsewhere, loser, self.second),
-            torch.where(elsewhere, torch.minimum(loser, self.second), self.second),
-        )
-        self.best = torch.where(better, middle, self.best)
-        self.place = torch.where(better, place, self.place)
-
-    def finish(self, depths: Tensor) -> DepthMap:
-        """Depth and confidence of the winners."""
-        found = self.place >= 0
-        inverse = 1 / depths.double()
-        lower = self.place.clamp(0, len(depths) - 2).floor().long()
-        depth = 1 / torch.lerp(inverse[lower], inverse[lower + 1], (self.place - lower).double())
-        depth = torch.where(found, depth, 0.0).float()
-        correlation = (1 - self.best).clamp(0, 1)
-        unique = ((self.second - self.best) / self.second.clamp_min(1e-3)).clamp(0, 1)
-        confidence = torch.where(found, correlation * unique.sqrt() * _agreement(self.place), 0.0)
-        return DepthMap(depth, confidence, self.best.clamp_max(UNRELATED), self.place)
-
-
-def _box(cost: Tensor, side: int) -> Tensor:
-    """Average (d, h, w) over side x side pixels; at the border over those that exist."""
-    return avg_pool2d(cost, side, 1, side // 2, count_include_pad=False) if side > 1 else cost
 
 
 def _agreement(place: Tensor, radius: int = 2) -> Tensor:

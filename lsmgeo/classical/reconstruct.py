@@ -121,7 +121,7 @@ def reconstruct_view(
     cameras = stack([resize(scene.camera(index), *shape) for index in (view, *chosen)])
     number = planes if planes is not None else number_of_planes(cameras, near, far)
     depths = depth_planes(near, far, number, spacing="inverse")
-    depth_map = sweep(images, cameras, depths, min_views=min_views, memory=memory, progress=progress)
+    depth_map = sweep(images, cameras, depths, min_views=min_views - 1, memory=memory, progress=progress)
 
     specks = round(SPECK_FRACTION * depth_map.depth.numel())
     mask = kept(depth_map, density, LEAST_CONFIDENCE, specks)

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from lsmgeo.cameras import CameraTensors
+from lsmgeo.classical.planes import longest_path
 from lsmgeo.data import PosedImages
 from lsmgeo.errors import OptionError
 
@@ -124,16 +125,7 @@ def number_of_planes(cameras: CameraTensors, near: float, far: float) -> int:
         near: first depth.
         far: last depth.
     """
-    K, E = cameras.intrinsics.double().numpy(), cameras.cam_from_world.double().numpy()
-    height, width = (int(torch.as_tensor(size)[0]) for size in (cameras.height, cameras.width))
-    pixel = np.array([(width - 1) / 2, (height - 1) / 2, 1.0])
-    ends = []
-    for depth in (near, far):
-        world = E[0, :3, :3].T @ (depth * np.linalg.solve(K[0], pixel) - E[0, :3, 3])
-        image = np.einsum("vij,vj->vi", K, E[:, :3, :3] @ world + E[:, :3, 3])[1:]
-        ends.append(image[:, :2] / np.maximum(image[:, 2:], 1e-6 * depth))
-    longest = np.linalg.norm(ends[0] - ends[1], axis=1).max()
-    return int(np.clip(np.ceil(longest) + 1, 32, 256))
+    return int(np.clip(np.ceil(longest_path(cameras, near, far)) + 1, 32, 256))
 
 
 def _angles(first: np.ndarray, second: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -1,0 +1,287 @@
+"""How unlike a reference image and its neighbours are at every plane of the reference's frustum."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, pad
+
+from lsmgeo import functional
+from lsmgeo._checks import check_choice, check_float, check_number, check_size, check_whole
+from lsmgeo.cameras import CameraTensors, select
+from lsmgeo.cameras.tensors import Cameras, as_tensors
+from lsmgeo.errors import OptionError, ShapeError
+from lsmgeo.grids import FrustumGrid
+
+__all__ = ["SCORES", "UNRELATED", "MatchingCosts", "aggregate_views", "matching_costs", "matching_costs_slabs"]
+
+SCORES = ("zncc", "sad", "census", "cosine")
+# What unrelated patches cost on average, and places that nobody sees.
+UNRELATED = 1.0
+LUMINANCE = (0.299, 0.587, 0.114)
+
+
+class MatchingCosts(NamedTuple):
+    """The cost of every neighbour at every site of a reference's frustum, and which neighbour sees which site."""
+
+    costs: Tensor  # (V-1, P, h, w)
+    visible: Tensor  # (V-1, P, h, w) bool
+
+
+def matching_costs(
+    images: Tensor,
+    cameras: Cameras,
+    depths: Tensor,
+    *,
+    size: tuple[int, int] | None = None,
+    score: str = "zncc",
+    window: int = 5,
+    noise: float = 2 / 255,
+) -> MatchingCosts:
+    """Compare every neighbour with the reference, the first view, at every plane of the reference's frustum.
+
+    Every neighbour is warped onto every plane and patches of the warped image are compared with those of the
+    reference, so that a patch turns, scales and foreshortens as the view does (Collins, "A space-sweep approach to
+    true multi-image matching", CVPR 1996). Equation, with means E over a patch's pixels, r of the reference, s warped:
+
+    - "zncc": ``1 - cov(r, s) / sqrt((var r + noise^2) (var s + noise^2))`` of luminances, in [0, 2]: one minus the
+      zero-mean normalised cross-correlation, where a patch without texture resembles nothing, not even another one;
+    - "sad": ``E |r - s|``, the mean absolute difference over all channels;
+    - "census": twice the fraction of a patch's pixels that are darker than its centre in one image alone, in [0, 2]
+      (Zabih and Woodfill, "Non-parametric local transforms", ECCV 1994), of luminances;
+    - "cosine": ``1 - E r.s / sqrt((E r.r + noise^2) (E s.s + noise^2))``, in [0, 2], for learned features.
+
+    Convention:
+        Depth is camera z of the first view. Integer pixel centres. At the border a patch is what of it exists. A
+        neighbour that does not reach a site is not `visible` there; its cost is that of its nearest pixels.
+
+    Args:
+        images: (V, C, h, w), the reference first: C = 1 grey, C = 3 RGB, any C of features for "cosine" and "sad".
+        cameras: leading shape (V,), of the images as they are or of the originals, whatever their sizes.
+        depths: (P,) camera z in the reference, world units, positive, ascending.
+        size: (h', w') at which the reference's frustum is sampled; by default that of the images.
+        score: "zncc", "sad", "census" or "cosine".
+        window: side of the patches in pixels of the reference, odd; 1 is a single pixel.
+        noise: standard deviation of the values below which texture counts for little; positive.
+
+    Returns:
+        `MatchingCosts`: costs (V-1, P, h', w') of the images' dtype, and visible (V-1, P, h', w'). Differentiable in
+        images, cameras and depths ("census" is constant).
+
+    Raises:
+        OptionError: an unknown score, an even window, no noise.
+        ShapeError, DTypeError, DeviceError, CameraError, GridError: as `lsmgeo.functional.unproject`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.cameras import CameraTensors
+        >>> K = torch.tensor([[8.0, 0.0, 3.5], [0.0, 8.0, 3.5], [0.0, 0.0, 1.0]]).expand(2, 3, 3)
+        >>> E = torch.eye(4).repeat(2, 1, 1)
+        >>> E[1, 0, 3] = -1.0  # the second camera stands one unit to the right: 8 / depth pixels of disparity
+        >>> left = torch.rand(1, 8, 8, generator=torch.Generator().manual_seed(0))
+        >>> images = torch.stack((left, left.roll(-2, -1)))
+        >>> costs, visible = matching_costs(images, CameraTensors(K, E, 8, 8), torch.tensor([2.0, 4.0, 8.0]), window=3)
+        >>> bool(costs[0, 1, 4, 4] < 1e-3 < costs[0, 0, 4, 4])
+        True
+    """
+    check_float("matching_costs", "depths", depths, "(P,)", rank=1)
+    slabs = matching_costs_slabs(
+        images, cameras, depths, depths.shape[0], size=size, score=score, window=window, noise=noise
+    )
+    return next(slabs)[1]
+
+
+def matching_costs_slabs(
+    images: Tensor,
+    cameras: Cameras,
+    depths: Tensor,
+    planes_per_slab: int,
+    *,
+    size: tuple[int, int] | None = None,
+    score: str = "zncc",
+    window: int = 5,
+    noise: float = 2 / 255,
+) -> Iterator[tuple[int, MatchingCosts]]:
+    """`matching_costs` for more planes than fit into memory: one slab of planes after another.
+
+    Args:
+        images: (V, C, h, w).
+        cameras: leading shape (V,).
+        depths: (P,), all planes.
+        planes_per_slab: planes of a slab; the last may have fewer.
+        size: see `matching_costs`, like all further options.
+        score: see `matching_costs`.
+        window: see `matching_costs`.
+        noise: see `matching_costs`.
+
+    Yields:
+        ``(start, costs)``: what `matching_costs` gives at planes start to start + planes_per_slab.
+
+    Raises:
+        OptionError, ShapeError, DTypeError, DeviceError, CameraError, GridError: at the call, before the first slab.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.cameras import orbit
+        >>> cameras = orbit(torch.tensor([0.0, 10.0]), 0.0, 2.0, focal_length=8.0, height=6, width=8)
+        >>> slabs = matching_costs_slabs(torch.rand(2, 1, 6, 8), cameras, torch.linspace(1.5, 2.5, 5), 2)
+        >>> [(start, tuple(costs.shape)) for start, (costs, visible) in slabs]
+        [(0, (1, 2, 6, 8)), (2, (1, 2, 6, 8)), (4, (1, 1, 6, 8))]
+    """
+    who = "matching_costs"
+    check_choice(who, "score", score, SCORES)
+    window = check_whole(who, "window", window, 1)
+    if window % 2 == 0:
+        raise OptionError(f"{who}: window must be odd; got {window}")
+    if not check_number(who, "noise", noise, "a positive number") > 0:
+        raise OptionError(f"{who}: noise must be a positive number; got {noise}")
+    planes_per_slab = check_whole(who, "planes_per_slab", planes_per_slab, 1)
+    check_float(who, "images", images, "(V, C, h, w)", rank=4)
+    if images.shape[0] < 2:
+        raise ShapeError(f"{who}: images must be (V, C, h, w) with V at least 2; got {tuple(images.shape)}")
+    check_float(who, "depths", depths, "(P,)", rank=1)
+    tensors = as_tensors(cameras, who)
+    if tuple(tensors.cam_from_world.shape[:-2]) != (len(images),):
+        raise ShapeError(
+            f"{who}: cameras must have the images' leading shape (V,) = ({len(images)},); "
+            f"got {tuple(tensors.cam_from_world.shape[:-2])}"
+        )
+    frame = (images.shape[2], images.shape[3]) if size is None else check_size(who, "size", size, 2, "(h, w)")
+    if score in ("zncc", "census"):
+        images = luminance(images)
+    first = select(tensors, 0, 0)
+    alone, others = (
+        CameraTensors(*(torch.as_tensor(field)[part] for field in tensors)) for part in (slice(0, 1), slice(1, None))
+    )
+    grid = FrustumGrid(first, depths, (frame[0], frame[1]))
+    reference = images[0]
+    if tuple(reference.shape[1:]) != tuple(frame):
+        # The reference's own frustum meets its image at the same pixels on every plane.
+        plane = FrustumGrid(first, depths[:1].detach(), (frame[0], frame[1]))
+        reference = functional.unproject(images[None, :1], alone, plane, padding_mode="border").volume[0, 0, :, 0]
+    compare = _comparison(score, reference, window, noise)
+    warped = functional.unproject_slabs(images[None, 1:], others, grid, planes_per_slab, padding_mode="border")
+
+    def slabs() -> Iterator[tuple[int, MatchingCosts]]:
+        for start, volume, visible in warped:
+            yield start, MatchingCosts(compare(volume[0]), visible[0])
+
+    return slabs()
+
+
+def luminance(images: Tensor) -> Tensor:
+    """Grey values (V, 1, h, w) of RGB images; grey images are themselves.
+
+    Raises:
+        ShapeError: neither 1 nor 3 channels.
+    """
+    if images.shape[1] == 1:
+        return images
+    if images.shape[1] != 3:
+        raise ShapeError(f"images must be (V, 1, h, w) or (V, 3, h, w) for this score; got {tuple(images.shape)}")
+    return (images * images.new_tensor(LUMINANCE)[:, None, None]).sum(1, keepdim=True)
+
+
+def _comparison(score: str, reference: Tensor, window: int, noise: float) -> Callable[[Tensor], Tensor]:
+    """The costs (N, d, h, w) of warped neighbours (N, C, d, h, w) against a reference (C, h, w)."""
+    if score == "zncc":
+        # Correlation ignores an offset; without it squares lose less to rounding.
+        shift = reference.detach().mean()
+        grey = reference[0] - shift
+        mean, spread = window_means(grey, window), _variance(grey, window) + noise**2
+
+        def zncc(warped: Tensor) -> Tensor:
+            other = warped[:, 0] - shift
+            covariance = window_means(other * grey, window) - window_means(other, window) * mean
+            return 1 - covariance * (spread * (_variance(other, window) + noise**2)).rsqrt()
+
+        return zncc
+    if score == "cosine":
+        energy = window_means(reference.square().mean(0), window) + noise**2
+
+        def cosine(warped: Tensor) -> Tensor:
+            dot = window_means((warped * reference[:, None]).mean(1), window)
+            return 1 - dot * (energy * (window_means(warped.square().mean(1), window) + noise**2)).rsqrt()
+
+        return cosine
+    if score == "sad":
+        return lambda warped: window_means((warped - reference[:, None]).abs().mean(1), window)
+
+    def census(warped: Tensor) -> Tensor:
+        return _census(reference[0], warped[:, 0], window)
+
+    return census
+
+
+def window_means(values: Tensor, window: int) -> Tensor:
+    """Means (..., h, w) over window x window pixels, at the border over those that exist."""
+    if window == 1:
+        return values
+    flat = values.reshape(1, -1, *values.shape[-2:])
+    rows = avg_pool2d(flat, (1, window), 1, (0, window // 2), count_include_pad=False)
+    return avg_pool2d(rows, (window, 1), 1, (window // 2, 0), count_include_pad=False).reshape(values.shape)
+
+
+def _variance(values: Tensor, window: int) -> Tensor:
+    return (window_means(values.square(), window) - window_means(values, window).square()).clamp_min(0)
+
+
+def _census(reference: Tensor, warped: Tensor, window: int) -> Tensor:
+    """Twice the fraction of differing bits "darker than the centre" among the pixels that exist."""
+    radius = window // 2
+    height, width = reference.shape
+    differing, count = torch.zeros_like(warped), torch.zeros_like(reference)
+    exists = pad(torch.ones_like(reference), (radius,) * 4)
+    around = [pad(values.detach(), (radius,) * 4) for values in (reference, warped)]
+    for y in range(window):
+        for x in range(window):
+            if y == x == radius:
+                continue
+            inside = exists[y : y + height, x : x + width]
+            first, second = (values[..., y : y + height, x : x + width] for values in around)
+            differing += ((first < reference) ^ (second < warped)) * inside
+            count += inside
+    return differing * (2 / count.clamp_min(1))
+
+
+def aggregate_views(
+    costs: Tensor, visible: Tensor, *, best: int | None = None, min_views: int = 1
+) -> tuple[Tensor, Tensor]:
+    """One cost a site: the mean over the neighbours that match best among those that see it.
+
+    What a neighbour sees of a point is often hidden by something in front; taking only the better half leaves it out
+    (Kang, Szeliski and Chai, "Handling occlusions in dense multi-view stereo", CVPR 2001, section 4.1).
+
+    Args:
+        costs: (V-1, P, h, w), see `matching_costs`.
+        visible: (V-1, P, h, w) bool.
+        best: how many neighbours are averaged, fewer where fewer see a site; by default half of them, rounded up.
+        min_views: least number of neighbours that must see a site.
+
+    Returns:
+        Costs (P, h, w), `UNRELATED` where fewer than `min_views` neighbours see a site, and how many do, (P, h, w).
+        Differentiable in `costs`.
+
+    Raises:
+        OptionError: `best` or `min_views` is no number from 1 to that of the neighbours.
+
+    Example:
+        >>> import torch
+        >>> costs = torch.tensor([0.1, 0.9, 0.3, 0.0])[:, None, None, None]
+        >>> cost, count = aggregate_views(costs, torch.tensor([True, True, True, False])[:, None, None, None])
+        >>> cost.item(), count.item()
+        (0.20000000298023224, 3)
+    """
+    who = "aggregate_views"
+    number = costs.shape[0]
+    best = check_whole(who, "best", (number + 1) // 2 if best is None else best, 1, number)
+    min_views = check_whole(who, "min_views", min_views, 1, number)
+    count = visible.sum(0)
+    if number == 1:
+        return torch.where(visible[0], costs[0], UNRELATED), count
+    lowest = torch.where(visible, costs, torch.inf).sort(0).values[:best]
+    total = torch.where(lowest.isfinite(), lowest, 0.0).sum(0)
+    return torch.where(count >= min_views, total / count.clamp(1, best), UNRELATED), count

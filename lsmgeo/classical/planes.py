@@ -1,0 +1,88 @@
+"""The depths of the planes of a sweep."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from lsmgeo._checks import check_choice, check_number, check_whole
+from lsmgeo.cameras.tensors import Cameras, as_tensors
+from lsmgeo.errors import OptionError, ShapeError
+from lsmgeo.grids import depth_planes
+
+__all__ = ["longest_path", "sweep_planes"]
+
+MOST_PLANES = 1 << 20
+
+
+def sweep_planes(
+    cameras: Cameras, near: float, far: float, num: int = 300, spacing: str = "inverse", *, step: float = 1.0
+) -> Tensor:
+    """Depths of the planes of a sweep from near to far, both included.
+
+    "inverse" makes even steps in the neighbours' images where they are beside the reference, "depth" even steps in the
+    world. "disparity" is "inverse" with as many planes as make a step of `step` pixels or less in the neighbour whose
+    sample of the reference's centre moves most.
+
+    Args:
+        cameras: leading shape (V,), the reference first, at the size at which they are matched; only "disparity" looks.
+        near: first depth, positive, world units.
+        far: last depth, larger.
+        num: number of planes, at least 3; not used by "disparity".
+        spacing: "inverse", "depth" or "disparity".
+        step: pixels, positive; only for "disparity".
+
+    Returns:
+        (P,) float64, ascending.
+
+    Raises:
+        OptionError: an unknown spacing, a step that is not positive or asks for more than 2^20 planes.
+        GridError: near and far not positive and ascending.
+
+    Example:
+        >>> from lsmgeo.cameras import orbit
+        >>> import torch
+        >>> cameras = orbit(torch.tensor([0.0, 15.0]), 0.0, 2.0, focal_length=100.0, height=60, width=80)
+        >>> len(sweep_planes(cameras, 1.5, 2.5)), len(sweep_planes(cameras, 1.5, 2.5, spacing="disparity"))
+        (300, 15)
+    """
+    who = "sweep_planes"
+    check_choice(who, "spacing", spacing, ("inverse", "depth", "disparity"))
+    num = check_whole(who, "num", num, 3, MOST_PLANES)
+    ends = (torch.tensor(near, dtype=torch.float64), torch.tensor(far, dtype=torch.float64))
+    if spacing != "disparity":
+        return depth_planes(*ends, num, spacing=spacing)
+    if not check_number(who, "step", step, "a positive number of pixels") > 0:
+        raise OptionError(f"{who}: step must be a positive number of pixels; got {step}")
+    depth_planes(*ends, 2)  # checks them
+    number = math.ceil(longest_path(cameras, near, far) / step) + 1
+    if number > MOST_PLANES:
+        raise OptionError(f"{who}: step must be larger: {step} pixels would take {number} planes")
+    return depth_planes(*ends, max(number, 3), spacing="inverse")
+
+
+def longest_path(cameras: Cameras, near: float, far: float) -> float:
+    """Pixels that the sample of the reference's centre moves from near to far in the neighbour that moves it most.
+
+    Args:
+        cameras: leading shape (V,), the reference first.
+        near: first depth.
+        far: last depth.
+    """
+    tensors = as_tensors(cameras, "longest_path")
+    if tensors.cam_from_world.dim() != 3 or len(tensors.cam_from_world) < 2:
+        raise ShapeError(
+            f"longest_path: cameras must have leading shape (V,), V at least 2; "
+            f"got {tuple(tensors.cam_from_world.shape[:-2])}"
+        )
+    K, E = tensors.intrinsics.double(), tensors.cam_from_world.double()
+    height, width = (float(torch.as_tensor(size)[0]) for size in (tensors.height, tensors.width))
+    ray = torch.linalg.solve(K[0], K.new_tensor([(width - 1) / 2, (height - 1) / 2, 1.0]))
+    ends = []
+    for depth in (near, far):
+        world = E[0, :3, :3].T @ (depth * ray - E[0, :3, 3])
+        image = (K @ (E[:, :3, :3] @ world + E[:, :3, 3])[..., None])[1:, :, 0]
+        ends.append(image[:, :2] / image[:, 2:].clamp_min(1e-6 * depth))
+    return float((ends[0] - ends[1]).norm(dim=1).max())

@@ -51,7 +51,8 @@ def depth_errors(predicted: Tensor, depth: Tensor, mask: Tensor | None = None) -
 
     Equation: with p predicted, d true, over the n pixels that count: l1 ``sum |p - d| / n``, abs_rel
     ``sum |p - d| / d / n``, rmse ``sqrt(sum (p - d)^2 / n)``, delta_k the share with ``max(p / d, d / p) < 1.25^k``
-    (Eigen, Puhrsch and Fergus 2014, section 4). A prediction below 0 is in no delta.
+    (Eigen, Puhrsch and Fergus 2014, section 4). A prediction below 0 is in no delta; one that is NaN neither, and
+    makes the other errors of its map NaN.
 
     Convention: depth is camera z, 0 means none. A pixel counts where the mask allows it, the true depth is above 0 and
     finite, and the prediction is not 0. ``density`` says how many are left out for the last reason.
@@ -157,7 +158,8 @@ def median_depth_error(
 ) -> MedianDepthError:
     """Measure depth maps as Kar et al. 2017 (section 4, "Comparison with plane sweeping") do.
 
-    Equation: ``median |p - d|`` over the pixels that count; of an even number the mean of the two in the middle.
+    Equation: ``median |p - d|`` over the pixels that count; of an even number the mean of the two in the middle. A
+    prediction that is NaN has an infinite error.
 
     Convention: depth is camera z, 0 means none; an object in the unit cube about the origin, seen from distance
     ``center``, lies within ``center +- sqrt(3) / 2``. A pixel counts where both depths exist and
@@ -206,8 +208,7 @@ def median_depth_error(
         counts = counts & ((d - middle).abs() <= radius)
     else:
         counts = counts & (p > middle - radius) & (p < middle + radius)
-    # NaN beside the pixels that count would be sorted behind infinity as well.
-    errors = torch.where(counts, (p - d).abs(), torch.inf).flatten(-2)
+    errors = torch.where(counts, (p - d).abs().nan_to_num(torch.inf, torch.inf), torch.inf).flatten(-2)
     return MedianDepthError(middle_of_lowest(errors, counts.flatten(-2).sum(-1)), counts.sum((-2, -1)))
 
 

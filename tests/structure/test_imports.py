@@ -94,7 +94,7 @@ def test_data_and_scenes_stand_below_models(module):
     assert own & OUTSIDE_THE_CORE <= MAY_ALSO_IMPORT[part(module)] | {part(module)}
 
 
-@pytest.mark.parametrize("package", ["lsmgeo.scenes", "lsmgeo.scenes.synthetic13", "lsmgeo.data"])
+@pytest.mark.parametrize("package", ["lsmgeo.scenes", "lsmgeo.scenes.synthetic13", "lsmgeo.data", "lsmgeo.metrics"])
 def test_scenes_and_data_import_lightly(package):
     new = {name.split(".")[0] for name in loaded_by(f"import {package}") - loaded_by("import torch, kornia.geometry")}
     assert new & (HEAVY | {"embreex", "manifold3d", "joblib", "distributed", "webdataset"}) == set()

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import lsmgeo
-from lsmgeo import cameras, errors, functional, fusion, grids, kernels, layers, rays
+from lsmgeo import cameras, errors, functional, fusion, grids, kernels, layers, metrics, rays
 
 INVENTORY = {
     lsmgeo: {
@@ -30,6 +30,11 @@ INVENTORY = {
     layers: {"PlaneSweepProject", "Unproject"},
     fusion: {"Max", "Mean", "Variance"},
     rays: {"Composited", "ProjectReduce", "composite", "expected_depth", "max_along_rays", "project_reduce"},
+    metrics: {
+        "BadPixels", "CategoryMeans", "CloudScores", "DensityCurve", "DepthError", "DepthErrors", "MedianDepthError",
+        "Running", "RunningDensityCurve", "VoxelIoU", "bad_pixel_rate", "category_means", "density_curve",
+        "depth_errors", "median_depth_error", "point_cloud_scores", "voxel_iou",
+    },
     errors: {
         "BackendError", "CameraError", "DTypeError", "DataError", "DeviceError", "GridError", "LsmGeoError",
         "OptionError", "ShapeError",
@@ -85,7 +90,7 @@ def test_the_signatures(function):
 
 
 def public_functions():
-    for module in (functional, cameras, grids, layers, fusion, rays):
+    for module in (functional, cameras, grids, layers, fusion, rays, metrics):
         for name in module.__all__:
             value = getattr(module, name)
             own = inspect.isfunction(value) or (inspect.isclass(value) and not hasattr(value, "_fields"))

@@ -1,22 +1,44 @@
 """Reconstruction without learning, on the library's own operators."""
 
+from lsmgeo.classical.consistency import consistent_views
+from lsmgeo.classical.filtering import guided_filter
 from lsmgeo.classical.matching import MatchingCosts, aggregate_views, matching_costs, matching_costs_slabs
 from lsmgeo.classical.plane_sweep import DepthMap, kept, sweep
 from lsmgeo.classical.planes import sweep_planes
-from lsmgeo.classical.reconstruct import Reconstruction, reconstruct_view
+from lsmgeo.classical.reconstruct import Reconstruction, SceneReconstruction, reconstruct_scene, reconstruct_view
+from lsmgeo.classical.silhouettes import signed_distance, silhouettes
+from lsmgeo.classical.surface import SurfaceMesh, drop_specks, extract_mesh, write_mesh
+from lsmgeo.classical.tsdf import Tsdf, fuse_depth
 from lsmgeo.classical.views import default_depth_range, select_neighbours
+from lsmgeo.classical.visual_hull import VisualHull, default_grid, hull_box, visual_hull
 
 __all__ = [
     "DepthMap",
     "MatchingCosts",
     "Reconstruction",
+    "SceneReconstruction",
+    "SurfaceMesh",
+    "Tsdf",
+    "VisualHull",
     "aggregate_views",
+    "consistent_views",
     "default_depth_range",
+    "default_grid",
+    "drop_specks",
+    "extract_mesh",
+    "fuse_depth",
+    "hull_box",
+    "guided_filter",
     "kept",
     "matching_costs",
     "matching_costs_slabs",
+    "reconstruct_scene",
     "reconstruct_view",
     "select_neighbours",
+    "signed_distance",
+    "silhouettes",
     "sweep",
     "sweep_planes",
+    "visual_hull",
+    "write_mesh",
 ]

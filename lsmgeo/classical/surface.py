@@ -1,0 +1,226 @@
+"""Triangle meshes out of grids, and files of them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from lsmgeo._checks import check_number, check_whole, describe
+from lsmgeo.classical.tsdf import Tsdf
+from lsmgeo.data.files import write_atomic
+from lsmgeo.errors import DataError, DTypeError, GridError, OptionError, ShapeError
+from lsmgeo.grids import VoxelGrid
+
+__all__ = ["SurfaceMesh", "drop_specks", "extract_mesh", "write_mesh"]
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMesh:
+    """Triangles with a colour at every vertex.
+
+    Attributes:
+        vertices: (N, 3) float32, world.
+        faces: (M, 3) int64 vertex numbers; seen from outside, counter-clockwise.
+        colours: (N, 3) uint8 RGB, or None.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colours: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        return f"SurfaceMesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
+
+
+def extract_mesh(
+    field: Tsdf | Tensor,
+    grid: VoxelGrid,
+    *,
+    level: float | None = None,
+    least_weight: float = 0.0,
+    specks: int = 0,
+) -> SurfaceMesh:
+    """The surface of a signed distance, of an occupancy or of any field that is larger inside, by marching cubes.
+
+    (Lorensen and Cline, SIGGRAPH 1987; in Lewiner's form, which is topologically right, from scikit-image.)
+
+    Convention:
+        Index i is the centre of voxel i. Of a `Tsdf`, cells are used of which all eight corners were seen, so that the
+        surface is open where nothing was seen; any other field is taken to be empty outside the grid, so that its
+        surface is closed.
+
+    Args:
+        field: a `Tsdf`, or (D, H, W): bool, or numbers that are larger inside.
+        grid: where it lives.
+        level: the value on the surface: by default 0 for a `Tsdf`, 0.5 for others.
+        least_weight: a voxel of a `Tsdf` counts as seen where its weight is more than this.
+        specks: pieces with fewer faces than this are dropped.
+
+    Returns:
+        The mesh; without faces where nothing crosses the level. Coloured where the `Tsdf` is.
+
+    Raises:
+        ShapeError, DTypeError: a field that does not fit the grid.
+        GridError: a grid with one pose a scene.
+        OptionError: a level that is no number, negative specks.
+
+    Example:
+        >>> from lsmgeo import VoxelGrid, scenes
+        >>> from lsmgeo.classical import extract_mesh
+        >>> ball, grid = scenes.Scene([scenes.sphere((0, 0, 0), 0.3)]), VoxelGrid(16)
+        >>> extract_mesh(scenes.voxels([ball], grid)[0], grid)
+        SurfaceMesh(456 vertices, 908 faces)
+    """
+    who = "extract_mesh"
+    if not isinstance(grid, VoxelGrid):
+        raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
+    T = grid.world_from_lattice.detach().cpu().numpy()
+    if T.ndim != 2:
+        raise GridError(f"{who}: grid must be of one scene; got {grid}")
+    check_number(who, "least_weight", least_weight, "a number")
+    check_whole(who, "specks", specks, 0)
+    if level is not None:
+        check_number(who, "level", level, "a number")
+    values = field.distance if isinstance(field, Tsdf) else field
+    if not isinstance(values, Tensor):
+        raise DTypeError(f"{who}: field must be a Tsdf or a tensor (D, H, W); got {describe(values)}")
+    if tuple(values.shape) != grid.shape:
+        raise ShapeError(f"{who}: field must be {grid.shape}, as the grid; got {tuple(values.shape)}")
+    values = values.detach().cpu()
+    if isinstance(field, Tsdf):
+        surface = 0.0 if level is None else level
+        # Larger inside, like every other field.
+        inside = (surface - values).float().numpy()
+        cells = _seen_cells(field.weight.detach().cpu().numpy() > least_weight)
+        offset = 0
+    else:
+        surface = 0.5 if level is None else level
+        inside = (values.double() - surface).float().numpy()
+        inside = np.pad(inside, 1, constant_values=min(-abs(float(inside.min())), -1e-3 * float(np.abs(inside).max())))
+        cells, offset = None, 1
+    index, faces = _march(inside, cells)
+    index -= offset
+    if np.linalg.det(T[:3, :3]) < 0:
+        faces = faces[:, ::-1]
+    vertices = (index @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+    colours = None
+    if isinstance(field, Tsdf) and field.colours is not None:
+        colours = _colours_at(field.colours, index)
+    mesh = SurfaceMesh(vertices, np.ascontiguousarray(faces), colours)
+    return drop_specks(mesh, specks) if specks else mesh
+
+
+def drop_specks(mesh: SurfaceMesh, faces: int) -> SurfaceMesh:
+    """Drop the connected pieces that have fewer faces, and vertices that no face uses.
+
+    Args:
+        mesh: any.
+        faces: least number of faces of a piece that stays.
+
+    Returns:
+        What is left, perhaps nothing.
+    """
+    if len(mesh.faces) == 0:
+        return mesh
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(mesh.vertices)
+    ends = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    links = coo_array((np.ones(len(ends), np.uint8), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    _, piece = connected_components(links, directed=False)
+    piece_of_face = piece[mesh.faces[:, 0]]
+    large = np.bincount(piece_of_face, minlength=piece.max() + 1) >= faces
+    return _without_unused(mesh, mesh.faces[large[piece_of_face]])
+
+
+def write_mesh(path: str | os.PathLike[str], mesh: SurfaceMesh) -> Path:
+    """Write a mesh as PLY or GLB, as the path's ending says, so that it is either wholly there or not at all.
+
+    Convention:
+        Coordinates are the mesh's own, also in GLB, whose viewers take y for up.
+
+    Args:
+        path: ends in .ply or .glb.
+        mesh: with one face at least.
+
+    Returns:
+        The path written.
+
+    Raises:
+        OptionError: another ending.
+        DataError: the mesh has no face, or the file cannot be written.
+    """
+    kind = Path(path).suffix[1:].lower()
+    if kind not in ("ply", "glb"):
+        raise OptionError(f"write_mesh: path must end in .ply or .glb; got {os.fspath(path)!r}")
+    if not isinstance(mesh, SurfaceMesh):
+        raise DTypeError(f"write_mesh: mesh must be a SurfaceMesh; got {describe(mesh)}")
+    if len(mesh.faces) == 0:
+        raise DataError(path, "the mesh has no face")
+    import trimesh
+
+    made = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colours, process=False)
+    content = made.export(file_type=kind)
+    assert isinstance(content, bytes)
+    return write_atomic(path, content)
+
+
+def _seen_cells(seen: np.ndarray) -> np.ndarray:
+    """Cells of which all corners are seen, named, as marching_cubes has it, by their last corner."""
+    cells = np.zeros_like(seen)
+    corners = [
+        seen[z : z - 1 or None, y : y - 1 or None, x : x - 1 or None] for z in (0, 1) for y in (0, 1) for x in (0, 1)
+    ]
+    if min(seen.shape) > 1:
+        cells[1:, 1:, 1:] = np.logical_and.reduce(corners)
+    return cells
+
+
+def _march(inside: np.ndarray, cells: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (N, 3) as x, y, z index, float64, and faces (M, 3), where a field crosses 0."""
+    nothing = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    if min(inside.shape) < 2 or not inside.min() < 0 < inside.max():
+        return nothing
+    from skimage.measure import marching_cubes
+
+    try:
+        vertices, faces, _, _ = marching_cubes(inside, 0.0, mask=cells)
+    except RuntimeError:  # no cell of the mask crosses the level
+        return nothing
+    mesh = SurfaceMesh(vertices[:, ::-1].astype(np.float64), faces.astype(np.int64))
+    mesh = _without_unused(mesh, _with_area(mesh))
+    return mesh.vertices, mesh.faces
+
+
+def _with_area(mesh: SurfaceMesh) -> np.ndarray:
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    return mesh.faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0]
+
+
+def _without_unused(mesh: SurfaceMesh, faces: np.ndarray) -> SurfaceMesh:
+    used, faces = np.unique(faces, return_inverse=True)
+    colours = None if mesh.colours is None else mesh.colours[used]
+    return SurfaceMesh(mesh.vertices[used], faces.reshape(-1, 3), colours)
+
+
+def _colours_at(colours: Tensor, index: np.ndarray) -> np.ndarray:
+    """Colours at fractional indices (N, 3), from the corners that have any: (N, 3) uint8."""
+    values = colours.detach().cpu().float().numpy()
+    known = (values.max(0) > 0).astype(np.float32)
+    size = np.array(values.shape[:0:-1])
+    low = np.clip(np.floor(index).astype(np.int64), 0, np.maximum(size - 2, 0))
+    part = index - low
+    total, weight = np.zeros((len(index), 3)), np.zeros(len(index))
+    for corner in np.ndindex(2, 2, 2):
+        share = np.where(corner, part, 1 - part).prod(1)
+        x, y, z = np.minimum(low + corner, size - 1).T
+        share = share * known[z, y, x]
+        total += share[:, None] * values[:, z, y, x].T
+        weight += share
+    mean = total / np.maximum(weight, 1e-12)[:, None]
+    return (np.clip(mean, 0, 1) * 255).round().astype(np.uint8)

@@ -1,0 +1,286 @@
+"""Depth maps of many views fused into one signed distance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d, pad
+
+from lsmgeo import functional
+from lsmgeo._checks import check_geometry, check_mask, check_number, describe
+from lsmgeo._sites import Cameras
+from lsmgeo.cameras import CameraTensors, as_tensors, resize, stack
+from lsmgeo.cameras.tensors import select
+from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
+from lsmgeo.grids import VoxelGrid
+
+__all__ = ["Tsdf", "fuse_depth", "voxel_side"]
+
+# Voxels on each side of a surface that hear of it by default.
+TRUNCATION = 3.0
+# Numbers alive for every voxel of a slab at the worst moment (measured).
+LIVE = 24
+
+
+class Tsdf(NamedTuple):
+    """A truncated signed distance on a grid: positive outside, negative inside, 0 on the surface."""
+
+    distance: Tensor  # (D, H, W) world units, in [-truncation, truncation]; 0 where the weight is
+    weight: Tensor  # (D, H, W) sum of the weights of the views, 0 where none saw
+    colours: Tensor | None  # (3, D, H, W) RGB in [0, 1], 0 where no surface is near
+
+
+def fuse_depth(
+    depths: Tensor | Iterable[Tensor],
+    cameras: Cameras,
+    grid: VoxelGrid,
+    *,
+    truncation: float | None = None,
+    colours: Tensor | Iterable[Tensor] | None = None,
+    weights: Tensor | Iterable[Tensor] | None = None,
+    background: Tensor | Iterable[Tensor] | None = None,
+    memory: int = 1 << 28,
+) -> Tsdf:
+    """Fuse depth maps into one signed distance, view after view.
+
+    Equation: ``D(X) = sum_v w_v clip(d_v) / sum_v w_v``, where ``d_v`` is the distance along view v's ray from X on to
+    the surface that its depth map shows there: positive in front of it, clipped to the truncation; voxels further
+    behind than the truncation learn nothing. A view's weight is the cosine between its ray and the surface's normal,
+    times ``(1 + d / truncation)^2`` behind the surface, so that the two sides of a thin thing disturb each other
+    little. (Curless and Levoy, "A volumetric method for building complex models from range images", SIGGRAPH 1996,
+    sections 3 and 5.)
+
+    Between pixels inverse depth is interpolated, which is exact on planes; next to a jump larger than the truncation,
+    and next to pixels without depth, the nearest pixel's is taken.
+
+    Convention:
+        Depth is camera z, 0 where there is none: such pixels say nothing, unless they are `background`. Integer pixel
+        centres; a depth map of another size than the camera's image is resized for.
+
+    Args:
+        depths: (V, h, w), or any iterable of V maps (h, w) of any sizes, read one at a time; float32 or float64.
+        cameras: V cameras.
+        grid: where to fuse; of one scene, any shape and pose.
+        truncation: world units; by default 3 times the longest side of a voxel.
+        colours: (V, 3, h, w) RGB in [0, 1], or an iterable of V, of the depth maps' sizes and dtype.
+        weights: (V, h, w) not negative, or an iterable of V: confidence that multiplies the weight of every pixel.
+        background: (V, h, w) bool, or an iterable of V: pixels of which it is known that their rays hit nothing. All
+            that they cross is outside. Their rim, one pixel wide, is left out.
+        memory: bound in bytes on what fusing holds beside the results and one view's maps.
+
+    Returns:
+        `Tsdf` of the depths' dtype. Not differentiable.
+
+    Raises:
+        ShapeError, DTypeError: maps that are none, of other sizes than the depth maps, or not V of them.
+        OptionError: negative or infinite depths or weights, a truncation that is not positive.
+        GridError: a grid with one pose a scene.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import VoxelGrid
+        >>> from lsmgeo.cameras import orbit
+        >>> from lsmgeo.classical import fuse_depth
+        >>> view = orbit(torch.zeros(1), 0.0, 2.0, focal_length=40.0, height=32, width=32)
+        >>> wall = torch.full((1, 32, 32), 2.0)
+        >>> fuse_depth(wall, view, VoxelGrid(4), truncation=0.5).distance[1, 2]
+        tensor([-0.3760, -0.1254,  0.1256,  0.3772])
+    """
+    who = "fuse_depth"
+    _check_grid(who, grid)
+    tensors = as_tensors(cameras, who)
+    if tensors.intrinsics.dim() != 3:
+        raise ShapeError(f"{who}: cameras must have the leading shape (V,); got {tuple(tensors.intrinsics.shape[:-2])}")
+    views = len(tensors.intrinsics)
+    truncation = TRUNCATION * voxel_side(grid) if truncation is None else truncation
+    if not check_number(who, "truncation", truncation, "a positive number") > 0:
+        raise OptionError(f"{who}: truncation must be a positive number; got {truncation!r}")
+    columns = [
+        _each(who, name, value, views)
+        for name, value in (
+            ("depths", depths),
+            ("colours", colours),
+            ("weights", weights),
+            ("background", background),
+        )
+    ]
+    sums: _Sums | None = None
+    with torch.no_grad():
+        for view, given in enumerate(zip(*columns, strict=True)):
+            maps = _checked(who, view, *given)
+            if sums is None:
+                sums = _Sums(grid, maps.depth, colours is not None)
+            elif maps.depth.dtype != sums.distance.dtype:
+                raise DTypeError(f"{who}: depths must be of one dtype; got {sums.distance.dtype}, {maps.depth.dtype}")
+            _fuse_view(sums, maps, select(tensors, 0, view), grid, truncation, memory)
+    assert sums is not None  # cameras are at least one
+    return sums.finish()
+
+
+def voxel_side(grid: VoxelGrid) -> float:
+    """The longest side of a grid's voxels, world units."""
+    return float(grid.world_from_lattice[..., :3, :3].norm(dim=-2).max())
+
+
+class _Maps(NamedTuple):
+    """What is known of one view's pixels, (h, w) each, colours (3, h, w)."""
+
+    depth: Tensor
+    colours: Tensor | None
+    weights: Tensor | None
+    background: Tensor | None
+
+
+class _Sums:
+    """Running sums over the views."""
+
+    def __init__(self, grid: VoxelGrid, like: Tensor, coloured: bool) -> None:
+        self.distance = like.new_zeros(grid.shape)
+        self.weight = torch.zeros_like(self.distance)
+        self.colours = like.new_zeros((3, *grid.shape)) if coloured else None  # type: ignore[misc]
+        self.near = torch.zeros_like(self.distance) if coloured else None
+
+    def finish(self) -> Tsdf:
+        self.distance /= torch.where(self.weight > 0, self.weight, 1)
+        if self.colours is not None and self.near is not None:
+            self.colours /= torch.where(self.near > 0, self.near, 1)
+        return Tsdf(self.distance, self.weight, self.colours)
+
+
+def _fuse_view(
+    sums: _Sums, maps: _Maps, camera: CameraTensors, grid: VoxelGrid, truncation: float, memory: int
+) -> None:
+    height, width = maps.depth.shape
+    smooth, nearest = _feature_maps(maps, resize(camera, height, width), truncation)
+    planes = _slab_planes(grid, smooth, memory)
+    views, augment = stack([camera]), ("depth", "direction")
+    interpolated = functional.unproject_slabs(
+        smooth, views, grid, planes, padding_mode="border", augment=augment, direction_frame="camera"
+    )
+    taken = functional.unproject_slabs(nearest, views, grid, planes, mode="nearest", padding_mode="border")
+    for (start, between, visible), (_, exact, _) in zip(interpolated, taken, strict=True):
+        seen = visible[0, 0]
+        if not bool(seen.any()):
+            continue
+        between, exact = between[0, 0], exact[0, 0]
+        here = slice(start, start + planes)
+        is_rough = between[1] > 0
+        inverse = torch.where(is_rough, exact[0], between[0])
+        z, along = between[-4], between[-1]  # camera z, and z of the unit direction
+        known = seen & (exact[0] > 0) & (inverse > 0)
+        distance = (1 / torch.where(known, inverse, 1) - z) / along.clamp_min(1e-6)
+        known &= distance > -truncation
+        weight = exact[1] * (1 + distance / truncation).clamp(0, 1).square() * known
+        value = distance.clamp_max(truncation)
+        empty = seen & (exact[2] > 0)
+        weight = torch.where(empty, exact[1], weight)
+        value = torch.where(empty, truncation, value)
+        sums.distance[here] += torch.where(weight > 0, weight * value, 0)
+        sums.weight[here] += weight
+        if sums.colours is not None and sums.near is not None:
+            near = weight * (1 - value.abs() / truncation).clamp_min(0)
+            sums.colours[:, here] += torch.where(is_rough, exact[3:6], between[2:5]) * near
+            sums.near[here] += near
+
+
+def _feature_maps(maps: _Maps, camera: CameraTensors, truncation: float) -> tuple[Tensor, Tensor]:
+    """What is interpolated: inverse depth, roughness, colours; and what is not: inverse depth, weight, emptiness."""
+    depth = maps.depth
+    has_depth = depth > 0
+    inverse = torch.where(has_depth, 1 / torch.where(has_depth, depth, 1), 0)
+    # Pixels whose neighbourhood, in which all samples near them are interpolated, has a jump or a hole.
+    around = pad(depth[None, None], (1, 1, 1, 1), mode="replicate")
+    largest, smallest = max_pool2d(around, 3, 1), -max_pool2d(-around, 3, 1)
+    rough = ((largest - smallest > truncation) | (smallest <= 0))[0, 0]
+    weight = _cosine(inverse, camera)
+    empty = torch.zeros_like(depth)
+    if maps.background is not None:
+        empty = -max_pool2d(-maps.background[None, None].to(depth.dtype), 3, 1, 1)[0, 0]
+        weight = torch.where(empty > 0, 1, weight)
+    if maps.weights is not None:
+        weight = weight * maps.weights
+    colours = () if maps.colours is None else tuple(maps.colours)
+    smooth = torch.stack((inverse, rough.to(depth.dtype), *colours))
+    nearest = torch.stack((inverse, weight, empty, *colours))
+    return smooth[None, None], nearest[None, None]
+
+
+def _cosine(inverse: Tensor, camera: CameraTensors) -> Tensor:
+    """Cosine between ray and surface normal, (h, w); 0 where there is no depth, 1 where no neighbour has any.
+
+    The plane ``n . X = 1`` of the camera's frame has the inverse depth ``n . K^-1 p``, linear in the pixel p, so its
+    gradient gives n, and the cosine is ``1 / (|n| |X|)``.
+    """
+    height, width = inverse.shape
+    K = camera.intrinsics.to(inverse)
+    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    u, v = u.to(inverse), v.to(inverse)
+    du, dv = _slope(inverse, 1), _slope(inverse, 0)
+    normal = torch.stack((du, dv, inverse - du * u - dv * v), -1) @ K
+    ray = torch.linalg.solve_triangular(K, torch.stack((u, v, torch.ones_like(u)), -1).reshape(-1, 3).T, upper=True)
+    length = ray.norm(dim=0).reshape(height, width)
+    found = inverse > 0
+    return torch.where(found, (inverse / (normal.norm(dim=-1) * length).clamp_min(1e-30)).clamp(0, 1), 0)
+
+
+def _slope(inverse: Tensor, axis: int) -> Tensor:
+    """Change to the next pixel along an axis: the smaller of the two one-sided ones, which crosses no jump."""
+    step = inverse.diff(dim=axis)
+    found = inverse > 0
+    valid = found.narrow(axis, 0, step.shape[axis]) & found.narrow(axis, 1, step.shape[axis])
+    step = torch.where(valid, step, torch.inf)
+    missing = torch.full_like(inverse.narrow(axis, 0, 1), torch.inf)
+    after, before = torch.cat((step, missing), axis), torch.cat((missing, step), axis)
+    slope = torch.where(after.abs() <= before.abs(), after, before)
+    return torch.where(slope.isfinite(), slope, 0)
+
+
+def _slab_planes(grid: VoxelGrid, features: Tensor, memory: int) -> int:
+    _, height, width = grid.shape  # type: ignore[misc]
+    return max(1, memory // (LIVE * features.element_size() * height * width))
+
+
+def _check_grid(who: str, grid: Any) -> None:
+    if not isinstance(grid, VoxelGrid):
+        raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
+    if grid.world_from_lattice.dim() != 2:
+        raise GridError(f"{who}: grid must be of one scene; got {grid}")
+
+
+def _each(who: str, name: str, value: Tensor | Iterable[Tensor] | None, views: int) -> Iterator[Tensor | None]:
+    """The maps of the views one after another; None for each where there are none."""
+    if value is None:
+        yield from (None,) * views
+        return
+    count = 0
+    for count, item in enumerate(value, 1):
+        if count > views:
+            break
+        yield item
+    if count != views:
+        raise ShapeError(f"{who}: {name} must hold one map for each of the {views} cameras; got {count}")
+
+
+def _checked(who: str, view: int, depth: Any, colours: Any, weights: Any, background: Any) -> _Maps:
+    check_geometry(who, f"depths[{view}]", depth, "(h, w)", rank=2)
+    size = tuple(depth.shape)
+    if not bool((depth.isfinite() & (depth >= 0)).all()):
+        raise OptionError(f"{who}: depths[{view}] must be finite and not negative, 0 where there is none")
+    if colours is not None:
+        check_geometry(who, f"colours[{view}]", colours, "(3, h, w)", rank=3, dtypes=(depth.dtype,))
+        if tuple(colours.shape) != (3, *size):
+            raise ShapeError(
+                f"{who}: colours[{view}] must be {(3, *size)}, of its depth map; got {tuple(colours.shape)}"
+            )
+    if weights is not None:
+        check_geometry(who, f"weights[{view}]", weights, "(h, w)", rank=2, dtypes=(depth.dtype,))
+        if tuple(weights.shape) != size:
+            raise ShapeError(f"{who}: weights[{view}] must be {size}, as its depth map; got {tuple(weights.shape)}")
+        if not bool((weights.isfinite() & (weights >= 0)).all()):
+            raise OptionError(f"{who}: weights[{view}] must be finite and not negative")
+    if background is not None:
+        check_mask(who, f"background[{view}]", background, size, "(h, w)")
+    return _Maps(depth, colours, weights, background)

@@ -1,0 +1,251 @@
+"""The largest solid that has given silhouettes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from lsmgeo import functional
+from lsmgeo._checks import check_choice, check_geometry, check_number, check_whole, describe
+from lsmgeo._sites import Cameras
+from lsmgeo.cameras import CameraTensors, as_tensors, crop, rays, resize, stack
+from lsmgeo.cameras.tensors import select
+from lsmgeo.classical.silhouettes import signed_distance
+from lsmgeo.errors import DTypeError, OptionError, ShapeError
+from lsmgeo.grids import VoxelGrid
+
+__all__ = ["VisualHull", "default_grid", "hull_box", "visual_hull"]
+
+RULES = ("mean", "all")
+# Bytes that a slab may take for every site and view: what is told of visibility, and the running statistics.
+BYTES_OF_A_VIEW, BYTES_OF_A_SITE = 2, 32
+# Voxels along an axis of the coarse hulls from which a box is told, and how often it is told anew.
+COARSE, ROUNDS, GROWTHS = 32, 3, 4
+
+# A map (h, w) and its camera, of that size.
+Picture = tuple[Tensor, CameraTensors]
+
+
+class VisualHull(NamedTuple):
+    """Which voxels a hull holds, and by how much."""
+
+    occupancy: Tensor  # (D, H, W) or (B, D, H, W) bool
+    support: Tensor  # the same shape: mean, or least, of what the silhouettes say of a voxel
+
+
+def visual_hull(
+    masks: Tensor,
+    cameras: Cameras,
+    grid: VoxelGrid,
+    *,
+    rule: str = "mean",
+    threshold: float | None = None,
+    outside: str = "empty",
+    mode: str = "bilinear",
+    memory: int = 1 << 28,
+) -> VisualHull:
+    """Carve a grid by silhouettes: what a voxel's centre meets in every view decides whether it stays.
+
+    Equation: with ``s_v(X)`` the silhouette of view v interpolated where X projects, "mean" keeps
+    ``sum_v s_v / V > threshold`` (Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017, section 5: 0.75),
+    and "all" ``min_v s_v > threshold`` (Laurentini, "The visual hull concept for silhouette-based image understanding",
+    PAMI 1994). No silhouette shows a concavity: the hull fills it, whatever the number of views.
+
+    Convention:
+        Integer pixel centres; masks of another size than the camera's image are resized for.
+
+    Args:
+        masks: (V, h, w) or (B, V, h, w): bool, or numbers that are larger on the object: a soft silhouette, or a
+            distance to its outline (see `lsmgeo.classical.signed_distance`), with a threshold of its own.
+        cameras: V cameras, or (B, V).
+        grid: any; with one pose a scene where masks have a batch.
+        rule: "mean" or "all".
+        threshold: a voxel stays whose support is more than this; by default 0.75 for "mean" and 0.5 for "all".
+        outside: what a view says of voxels that it does not see: "empty", that they are off the object, which is
+            then wholly in every picture; or "unknown", nothing, and voxels that no view sees are empty.
+        mode: "bilinear" or "nearest".
+        memory: bound in bytes on what carving holds beside masks and results.
+
+    Returns:
+        `VisualHull`.
+
+    Raises:
+        OptionError: an unknown rule, a threshold that is no number.
+        ShapeError, DTypeError, CameraError, GridError: as `lsmgeo.functional.unproject`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import VoxelGrid
+        >>> from lsmgeo.cameras import orbit
+        >>> from lsmgeo.classical import visual_hull
+        >>> views = orbit(torch.tensor([0.0, 90.0]), 0.0, 2.0, focal_length=32.0, height=16, width=16)
+        >>> masks = torch.zeros(2, 16, 16, dtype=torch.bool)
+        >>> masks[:, 4:12, 4:12] = True  # half the picture: from -0.25 to 0.25 at the distance of the middle
+        >>> visual_hull(masks, views, VoxelGrid(8)).occupancy.sum(dim=(0, 1))
+        tensor([ 0,  0, 16, 16, 16, 16,  0,  0])
+    """
+    who = "visual_hull"
+    check_choice(who, "rule", rule, RULES)
+    check_choice(who, "outside", outside, ("empty", "unknown"))
+    threshold = {"mean": 0.75, "all": 0.5}[rule] if threshold is None else threshold
+    check_number(who, "threshold", threshold, "a number")
+    check_whole(who, "memory", memory, 1)
+    if not isinstance(masks, Tensor):
+        raise DTypeError(f"{who}: masks must be a tensor (V, h, w) or (B, V, h, w); got {describe(masks)}")
+    if masks.dim() not in (3, 4):
+        raise ShapeError(f"{who}: masks must be (V, h, w) or (B, V, h, w); got {tuple(masks.shape)}")
+    if not isinstance(grid, VoxelGrid):
+        raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
+    values = masks if masks.is_floating_point() else masks.float()
+    check_geometry(who, "masks", values, "(V, h, w) or (B, V, h, w)")
+    batched = values if values.dim() == 4 else values[None]
+    scenes, views = batched.shape[:2]
+    # The least over the views is minus the largest of minus; elsewhere the sign changes nothing.
+    sign = -1.0 if rule == "all" else 1.0
+    _, height, width = grid.shape  # type: ignore[misc]
+    planes = max(1, memory // (scenes * height * width * (BYTES_OF_A_VIEW * views + BYTES_OF_A_SITE)))
+    support = batched.new_zeros((scenes, *grid.shape))  # type: ignore[misc]
+    with torch.no_grad():
+        slabs = functional.unproject_slabs(
+            sign * batched[:, :, None],
+            cameras,
+            grid,
+            planes,
+            mode=mode,
+            padding_mode="border",
+            reduce="max" if rule == "all" else "mean",
+        )
+        # What lies off every silhouette: 0, or the least that any mask says where masks are distances.
+        nothing = min(0.0, float(batched.min())) if batched.numel() else 0.0
+        for start, volume, visible in slabs:
+            said = sign * volume[:, 0]
+            count = visible.sum(1)
+            if outside == "unknown":
+                said = torch.where(count > 0, said, nothing)
+            elif rule == "all":
+                said = torch.where(count == views, said, nothing)
+            else:
+                said = (said * count + nothing * (views - count)) / views
+            support[:, start : start + planes] = said
+    support = support if masks.dim() == 4 else support[0]
+    return VisualHull(support > threshold, support)
+
+
+def hull_box(
+    masks: Sequence[Tensor] | Tensor, cameras: Cameras, *, margin: float = 0.02
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """A box along the world's axes that holds all that projects into every silhouette.
+
+    A cube about the point nearest to the rays through the middles of the silhouettes, as large as these say, is carved
+    coarsely, with silhouettes widened by the reach of a voxel so that nothing thin is lost; the box around what stays
+    is carved again. With views from about one side the hull has no end along their rays, and the box is cut off.
+
+    Args:
+        masks: (h, w) bool of every view, not empty; sizes may differ.
+        cameras: V cameras.
+        margin: by which the box is widened on each side, as a fraction of its longest side.
+
+    Returns:
+        Lower and upper corner as x, y, z.
+
+    Raises:
+        OptionError: a silhouette is empty, nothing projects into all of them, or margin is negative.
+    """
+    who = "hull_box"
+    tensors = as_tensors(cameras, who)
+    if check_number(who, "margin", margin, "a number, 0 at least") < 0:
+        raise OptionError(f"{who}: margin must be 0 at least; got {margin}")
+    if len(masks) == 0 or len(masks) != len(tensors.intrinsics):
+        raise ShapeError(
+            f"{who}: masks must be one for each of the {len(tensors.intrinsics)} cameras; got {len(masks)}"
+        )
+    for view, mask in enumerate(masks):
+        if not bool(mask.any()):
+            raise OptionError(f"{who}: the silhouette of view {view} is empty")
+    pictures = [(mask, resize(select(tensors, 0, view), *mask.shape)) for view, mask in enumerate(masks)]
+    middle, radius = _ball(pictures)
+    wide = [_with_rim(mask, camera) for mask, camera in pictures]
+    lower, upper = middle - radius, middle + radius
+    for _ in range(GROWTHS):
+        found = _carved(wide, lower, upper)
+        reaches = (found[0] <= lower).any() or (found[1] >= upper).any()
+        if not reaches or len(masks) < 3:
+            break
+        lower, upper = middle - (middle - lower) * 1.5, middle + (upper - middle) * 1.5
+    for _ in range(ROUNDS):
+        lower, upper = found
+        found = _carved(wide, lower, upper)
+    extra = margin * float((found[1] - found[0]).max())
+    low, high = (tuple(float(item) for item in corner) for corner in (found[0] - extra, found[1] + extra))
+    return low, high  # type: ignore[return-value]
+
+
+def default_grid(masks: Sequence[Tensor] | Tensor, cameras: Cameras, resolution: int = 128) -> VoxelGrid:
+    """A grid of cubic voxels around what projects into every silhouette: see `hull_box`.
+
+    Args:
+        masks: (h, w) bool of every view.
+        cameras: V cameras.
+        resolution: voxels along the longest side.
+    """
+    check_whole("default_grid", "resolution", resolution, 2, 4096)
+    lower, upper = (np.array(corner) for corner in hull_box(masks, cameras))
+    side = float((upper - lower).max()) / resolution
+    counts = np.maximum(np.ceil((upper - lower) / side - 1e-6), 1).astype(int)
+    center = (lower + upper) / 2
+    width, height, depth = (int(count) for count in counts)
+    low, high = center - counts * side / 2, center + counts * side / 2
+    return VoxelGrid((depth, height, width), low.tolist(), high.tolist())
+
+
+def _ball(pictures: Sequence[Picture]) -> tuple[np.ndarray, float]:
+    """About where, and how large, the object is: a point (3,) and a radius."""
+    left, right, spans = np.zeros((3, 3)), np.zeros(3), []
+    for mask, camera in pictures:
+        origin, directions = (value.double().numpy() for value in rays(camera, tuple(mask.shape)))  # type: ignore[arg-type]
+        on = directions[mask.cpu().numpy()]
+        axis = on.mean(0) / np.linalg.norm(on.mean(0))
+        across = np.eye(3) - np.outer(axis, axis)
+        left, right = left + across, right + across @ origin
+        cosine = (on @ axis).min().clip(0.1, 1.0)
+        spans.append((origin, np.sqrt(1 - cosine**2) / cosine))
+    if len(pictures) > 1 and np.linalg.cond(left) < 1e6:
+        middle = np.linalg.solve(left, right)
+    else:  # rays that meet nowhere: something as large as it is far
+        middle = spans[0][0] + axis
+    radius = max(tangent * np.linalg.norm(middle - origin) for origin, tangent in spans)
+    return middle, float(1.5 * radius)
+
+
+def _with_rim(mask: Tensor, camera: CameraTensors) -> Picture:
+    """Distance to the outline in a picture that reaches further than the silhouette's own, and its camera."""
+    rim = max(mask.shape) // 2
+    height, width = (side + 2 * rim for side in mask.shape)
+    return signed_distance(pad(mask, (rim,) * 4)), crop(camera, -rim, -rim, height, width)
+
+
+def _carved(pictures: Sequence[Picture], lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The box around those voxels of a coarse grid that may reach into the hull."""
+    grid = VoxelGrid(COARSE, lower.tolist(), upper.tolist())
+    centers = grid.lattice().centers()
+    half = 0.5 * float(np.linalg.norm((upper - lower) / COARSE))
+    keep = torch.ones(grid.shape, dtype=torch.bool)
+    for distance, camera in pictures:
+        volume, visible = functional.unproject(distance[None, None, None], stack([camera]), grid, padding_mode="border")
+        E, K = camera.cam_from_world.double(), camera.intrinsics.double()
+        depth = (centers @ E[2, :3] + E[2, 3]).clamp_min(1e-9)
+        # A ball of radius r at depth z projects into one of about f r / (z - r) pixels.
+        reach = float(K[:2, :2].abs().max()) * half / (depth - half).clamp_min(0.25 * half)
+        keep &= (volume[0, 0, 0] > -1.5 * reach - 1) & visible[0, 0]
+    if not bool(keep.any()):
+        raise OptionError(
+            "hull_box: nothing projects into all silhouettes: they and the cameras do not belong together"
+        )
+    index = keep.nonzero().numpy()
+    step = (upper - lower) / COARSE
+    return lower + index.min(0)[::-1] * step, lower + (index.max(0)[::-1] + 1) * step

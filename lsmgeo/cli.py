@@ -91,7 +91,7 @@ def reconstruct(
     out: str = "lsmgeo-reconstruct",
     neighbours: int = 4,
     size: int = 400,
-    planes: int | None = None,
+    planes: int = 300,
     near: float | None = None,
     far: float | None = None,
     density: float = 0.4,
@@ -107,7 +107,7 @@ def reconstruct(
         out: folder for the results; created where it does not exist.
         neighbours: number of other photographs to match with.
         size: longer side of the depth map in pixels.
-        planes: number of depth planes; by default a step is about a pixel.
+        planes: number of depth planes.
         near: nearest depth in world units; by default told from the scene.
         far: farthest depth.
         density: largest fraction of the pixels to keep.

@@ -2,27 +2,46 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
+from tqdm import tqdm
 
+from lsmgeo._checks import check_whole
 from lsmgeo.cameras import CameraTensors, rays, resize, stack
+from lsmgeo.classical.consistency import consistent_views
+from lsmgeo.classical.filtering import guided_filter
 from lsmgeo.classical.plane_sweep import DepthMap, kept, sweep
-from lsmgeo.classical.views import default_depth_range, number_of_planes, select_neighbours
+from lsmgeo.classical.planes import MOST_PLANES, sweep_planes
+from lsmgeo.classical.views import default_depth_range, select_neighbours
 from lsmgeo.data import PosedImages
 from lsmgeo.errors import OptionError
-from lsmgeo.grids import depth_planes
+from lsmgeo.grids import VoxelGrid
 
-__all__ = ["Reconstruction", "SparseError", "points_of", "reconstruct_view", "sparse_error"]
+if TYPE_CHECKING:
+    from lsmgeo.classical.surface import SurfaceMesh
+
+__all__ = [
+    "Reconstruction",
+    "SceneReconstruction",
+    "SparseError",
+    "points_of",
+    "reconstruct_scene",
+    "reconstruct_view",
+    "sparse_error",
+]
 
 # Confidence below which a pixel is never shown, however few there are: a winner without agreement around it.
 LEAST_CONFIDENCE = 0.1
 SPECK_FRACTION = 5e-4
-# As many as depth_planes makes.
-MOST_PLANES = 1 << 20
+# Standard deviation of luminance that counts as no texture.
+NOISE = 0.5 / 255
+SPECK_FACES = 100
 
 
 @dataclass(frozen=True)
@@ -49,6 +68,7 @@ class Reconstruction:
         points: (N, 3) float32 world positions of the kept pixels.
         colours: (N, 3) uint8.
         error: against the scene's sparse points, where it has any, among the best pixels of the wanted density.
+        support: (h, w) int64, how many other swept views agree; None where none were asked.
     """
 
     view: int
@@ -61,6 +81,24 @@ class Reconstruction:
     points: np.ndarray
     colours: np.ndarray
     error: SparseError | None
+    support: Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SceneReconstruction:
+    """What the sweeps of several views give together.
+
+    Attributes:
+        views: one reconstruction a view, with the pixels kept that other views agree with.
+        points: (N, 3) float32 world positions of all pixels kept.
+        colours: (N, 3) uint8.
+        mesh: their surface; None where none was asked for, or no pixel was kept.
+    """
+
+    views: tuple[Reconstruction, ...]
+    points: np.ndarray
+    colours: np.ndarray
+    mesh: SurfaceMesh | None
 
 
 def reconstruct_view(
@@ -68,68 +106,255 @@ def reconstruct_view(
     view: int,
     *,
     neighbours: int = 4,
-    size: int = 400,
-    planes: int | None = None,
+    size: int = 640,
+    planes: int = 300,
+    spacing: str = "inverse",
     near: float | None = None,
     far: float | None = None,
+    score: str = "zncc",
+    window: int = 5,
+    best: int | None = None,
+    filtered: bool = True,
     density: float = 0.4,
-    min_views: int = 3,
+    min_views: int | None = None,
     memory: int = 1 << 30,
     progress: bool = False,
 ) -> Reconstruction:
     """Reconstruct what one photograph sees, by plane-sweep stereo with its best neighbours.
 
     Args:
-        scene: posed photographs, see `lsmgeo.data.open`.
+        scene: posed photographs, see `lsmgeo.data.open`; two are enough.
         view: index of the reference.
-        neighbours: how many other views to match with, at least 2.
+        neighbours: how many other views to match with, at most.
         size: longer side of the depth map in pixels; never larger than the photograph.
-        planes: number of depth planes, evenly spaced in inverse depth; by default a step is about a pixel.
-        near: nearest depth, world units; by default told from the scene.
+        planes: number of depth planes; see `lsmgeo.classical.sweep_planes`.
+        spacing: "inverse", "depth" or "disparity" (then their number follows).
+        near: nearest depth, world units; by default told from the scene, see `lsmgeo.classical.default_depth_range`.
         far: farthest depth.
+        score: "zncc", "sad" or "census", see `lsmgeo.classical.matching_costs`.
+        window: side of the patches in pixels, odd.
+        best: how many neighbours are averaged at a site, see `lsmgeo.classical.aggregate_views`.
+        filtered: whether costs are averaged along the edges of the photograph, see `lsmgeo.classical.guided_filter`.
         density: largest fraction of the pixels to keep.
-        min_views: least number of views that must see a point.
+        min_views: least number of neighbours that must see a point; by default 2, or 1 where there is only one.
         memory: bound in bytes on what the sweep adds to the process.
         progress: whether to show a progress bar.
 
     Returns:
-        `Reconstruction`.
+        `Reconstruction`; its mask is empty where nothing can be trusted, as in photographs without texture.
 
     Raises:
         OptionError: an option out of range, or no range or neighbours can be told.
         DataError: a photograph cannot be read.
     """
-    for name, number, least in (("neighbours", neighbours, 2), ("size", size, 16), ("planes", planes, 3)):
-        if number is not None and number < least:
-            raise OptionError(f"{name} must be at least {least}; got {number}")
-    if planes is not None and planes > MOST_PLANES:
-        raise OptionError(f"planes must be at most {MOST_PLANES}; got {planes}")
-    if not 0 <= view < len(scene):
-        raise OptionError(f"view must lie in 0..{len(scene) - 1}; got {view}")
-    if not 0 < density <= 1:
-        raise OptionError(f"density must lie in (0, 1]; got {density}")
-    chosen = select_neighbours(scene, view, neighbours)
-    if near is None or far is None:
-        lower, upper = default_depth_range(scene, view, chosen)
-        near, far = near if near is not None else lower, far if far is not None else upper
-    if not 0 < near < far < float("inf"):
-        raise OptionError(f"near and far must be positive, finite and ascending; got {near} and {far}")
+    sweeper = _Sweeper(
+        scene, neighbours, size, planes, spacing, near, far, score, window, best, filtered, density, min_views, memory
+    )
+    sweeper.check_view(view)
+    return sweeper.reconstruct(view, progress)
 
-    shape = _working_size(scene, view, size)
-    # All photographs take the reference's size; the cameras' resize rule keeps them exact, even where aspects differ.
-    images = torch.stack([_resized(scene.load(index), shape) for index in (view, *chosen)])
-    cameras = stack([resize(scene.camera(index), *shape) for index in (view, *chosen)])
-    number = planes if planes is not None else number_of_planes(cameras, near, far)
-    depths = depth_planes(near, far, number, spacing="inverse")
-    depth_map = sweep(images, cameras, depths, min_views=min_views - 1, memory=memory, progress=progress)
 
-    specks = round(SPECK_FRACTION * depth_map.depth.numel())
-    mask = kept(depth_map, density, LEAST_CONFIDENCE, specks)
-    camera = CameraTensors(*(torch.as_tensor(value)[0] for value in cameras))
-    points = points_of(depth_map.depth, camera)[mask].float().numpy()
-    colours = (images[0].permute(1, 2, 0)[mask] * 255).round().to(torch.uint8).numpy()
-    error = sparse_error(scene, view, depth_map, kept(depth_map, density))
-    return Reconstruction(view, tuple(chosen), depths, images[0], camera, depth_map, mask, points, colours, error)
+def reconstruct_scene(
+    scene: PosedImages,
+    views: Sequence[int] | None = None,
+    *,
+    neighbours: int = 4,
+    size: int = 640,
+    planes: int = 300,
+    spacing: str = "inverse",
+    near: float | None = None,
+    far: float | None = None,
+    score: str = "zncc",
+    window: int = 5,
+    best: int | None = None,
+    filtered: bool = True,
+    density: float = 0.8,
+    min_views: int | None = None,
+    min_support: int | None = None,
+    mesh: bool = True,
+    resolution: int = 192,
+    memory: int = 1 << 30,
+    progress: bool = False,
+) -> SceneReconstruction:
+    """Reconstruct what several photographs see: depth maps that agree with each other, their points and their surface.
+
+    Every view is swept as `reconstruct_view` does; of its best pixels those are kept with which enough of the other
+    views agree (`lsmgeo.classical.consistent_views`), and the depth maps are fused (`lsmgeo.classical.fuse_depth`).
+
+    Args:
+        scene: posed photographs, see `lsmgeo.data.open`; two are enough.
+        views: the views to sweep; by default all. Each is matched with its best neighbours, swept or not.
+        neighbours: see `reconstruct_view`, like all options that are not described here.
+        size: see `reconstruct_view`.
+        planes: see `reconstruct_view`.
+        spacing: see `reconstruct_view`.
+        near: see `reconstruct_view`; told for every view by default.
+        far: see `reconstruct_view`.
+        score: see `reconstruct_view`.
+        window: see `reconstruct_view`.
+        best: see `reconstruct_view`.
+        filtered: see `reconstruct_view`.
+        density: see `reconstruct_view`; a bound, as pixels must find agreement besides.
+        min_views: see `reconstruct_view`.
+        min_support: least number of other swept views that must agree; by default 2, or as many as were swept besides.
+        mesh: whether to make the surface.
+        resolution: voxels along the longest side of the box in which the surface is made.
+        memory: bound in bytes on what one sweep adds to the process; depth maps and pictures of all views are kept.
+        progress: whether to show a progress bar, one step a view.
+
+    Returns:
+        `SceneReconstruction`.
+
+    Raises:
+        OptionError: an option out of range, or no range or neighbours can be told.
+        DataError: a photograph cannot be read.
+    """
+    sweeper = _Sweeper(
+        scene, neighbours, size, planes, spacing, near, far, score, window, best, filtered, density, min_views, memory
+    )
+    chosen = list(range(len(scene))) if views is None else list(views)
+    if not chosen or len(set(chosen)) != len(chosen):
+        raise OptionError(f"views must name at least one view, none twice; got {views}")
+    for view in chosen:
+        sweeper.check_view(view)
+    check_whole("reconstruct_scene", "resolution", resolution, 8)
+    if min_support is None:
+        min_support = min(2, len(chosen) - 1)
+    min_support = check_whole("reconstruct_scene", "min_support", min_support, 0, len(chosen) - 1)
+    with tqdm(chosen, desc="sweep", unit="view", disable=None if progress else True) as bar:
+        alone = [sweeper.reconstruct(view) for view in bar]
+    swept = tuple(sweeper.supported(one, alone, min_support) for one in alone)
+    points = np.concatenate([one.points for one in swept])
+    colours = np.concatenate([one.colours for one in swept])
+    surface = surface_of(swept, points, resolution) if mesh and len(points) else None
+    return SceneReconstruction(swept, points, colours, surface)
+
+
+@dataclass(frozen=True)
+class _Sweeper:
+    """The checked options of sweeps through the views of one scene."""
+
+    scene: PosedImages
+    neighbours: int
+    size: int
+    planes: int
+    spacing: str
+    near: float | None
+    far: float | None
+    score: str
+    window: int
+    best: int | None
+    filtered: bool
+    density: float
+    min_views: int | None
+    memory: int
+
+    def __post_init__(self) -> None:
+        for name, number, least in (
+            ("neighbours", self.neighbours, 1),
+            ("size", self.size, 16),
+            ("planes", self.planes, 3),
+        ):
+            if number < least:
+                raise OptionError(f"{name} must be at least {least}; got {number}")
+        if self.planes > MOST_PLANES:
+            raise OptionError(f"planes must be at most {MOST_PLANES}; got {self.planes}")
+        if not 0 < self.density <= 1:
+            raise OptionError(f"density must lie in (0, 1]; got {self.density}")
+
+    def check_view(self, view: int) -> None:
+        if not 0 <= view < len(self.scene):
+            raise OptionError(f"view must lie in 0..{len(self.scene) - 1}; got {view}")
+
+    def depth_range(self, view: int) -> tuple[float, float]:
+        near, far = self.near, self.far
+        if near is None or far is None:
+            lower, upper = default_depth_range(self.scene, view)
+            near, far = near if near is not None else lower, far if far is not None else upper
+        if not 0 < near < far < float("inf"):
+            raise OptionError(f"near and far must be positive, finite and ascending; got {near} and {far}")
+        return near, far
+
+    def reconstruct(self, view: int, progress: bool = False) -> Reconstruction:
+        scene = self.scene
+        near, far = self.depth_range(view)
+        chosen = select_neighbours(scene, view, self.neighbours, near=near, far=far)
+        shape = _working_size(scene, view, self.size)
+        # All photographs take the reference's size; the resize rule keeps cameras exact, even where aspects differ.
+        images = torch.stack([_resized(scene.load(index), shape) for index in (view, *chosen)])
+        cameras = stack([resize(scene.camera(index), *shape) for index in (view, *chosen)])
+        depths = sweep_planes(cameras, near, far, self.planes, self.spacing)
+        depth_map = sweep(
+            images,
+            cameras,
+            depths,
+            score=self.score,
+            window=self.window,
+            best=None if self.best is None else min(self.best, len(chosen)),
+            min_views=min(2, len(chosen)) if self.min_views is None else self.min_views,
+            cost_filter=guided_filter(images[0]) if self.filtered else None,
+            noise=NOISE,
+            memory=self.memory,
+            progress=progress,
+        )
+        camera = CameraTensors(*(torch.as_tensor(value)[0] for value in cameras))
+        one = Reconstruction(
+            view=view,
+            neighbours=tuple(chosen),
+            depths=depths,
+            image=images[0].clone(),
+            camera=camera,
+            depth_map=depth_map,
+            mask=torch.zeros(shape, dtype=torch.bool),
+            points=np.empty((0, 3), np.float32),
+            colours=np.empty((0, 3), np.uint8),
+            error=None,
+        )
+        return self._keep(one, torch.ones(shape, dtype=torch.bool))
+
+    def supported(self, one: Reconstruction, others: list[Reconstruction], least: int) -> Reconstruction:
+        """A reconstruction with what other views say of it."""
+        others = [other for other in others if other.view != one.view]
+        if not others:
+            return one
+        support = consistent_views(
+            one.depth_map.depth,
+            one.camera,
+            [other.depth_map.depth for other in others],
+            [other.camera for other in others],
+        )
+        trusted = (1 + support.clamp_max(3)) / 4
+        depth_map = one.depth_map._replace(confidence=one.depth_map.confidence * trusted)
+        return self._keep(replace(one, depth_map=depth_map, support=support), support >= least)
+
+    def _keep(self, one: Reconstruction, allowed: Tensor) -> Reconstruction:
+        """A reconstruction with the best of the allowed pixels."""
+        depth_map = one.depth_map
+        specks = round(SPECK_FRACTION * depth_map.depth.numel())
+        mask = kept(
+            depth_map._replace(depth=torch.where(allowed, depth_map.depth, 0.0)), self.density, LEAST_CONFIDENCE, specks
+        )
+        points = points_of(depth_map.depth, one.camera)[mask].float().numpy()
+        colours = (one.image.permute(1, 2, 0)[mask] * 255).round().to(torch.uint8).numpy()
+        error = sparse_error(self.scene, one.view, depth_map, kept(depth_map, self.density))
+        return replace(one, mask=mask, points=points, colours=colours, error=error)
+
+
+def surface_of(swept: Sequence[Reconstruction], points: np.ndarray, resolution: int) -> SurfaceMesh:
+    """The surface that the kept pixels of several views show, in a box around the middle 98 % of their points."""
+    from lsmgeo.classical.surface import extract_mesh
+    from lsmgeo.classical.tsdf import fuse_depth
+
+    low, high = np.percentile(points.astype(np.float64), (1, 99), axis=0)
+    margin = 0.1 * (high - low).max()
+    low, high = low - margin, high + margin
+    voxel = (high - low).max() / resolution
+    shape = np.maximum(np.ceil((high - low) / voxel).astype(int), 2)
+    depth, height, width = (int(number) for number in shape[::-1])
+    grid = VoxelGrid((depth, height, width), tuple(low.tolist()), tuple((low + voxel * shape).tolist()))
+    depths = (torch.where(one.mask, one.depth_map.depth, 0.0) for one in swept)
+    fused = fuse_depth(depths, stack([one.camera for one in swept]), grid, colours=(one.image for one in swept))
+    return extract_mesh(fused, grid, specks=SPECK_FACES)
 
 
 def points_of(depth: Tensor, camera: CameraTensors) -> Tensor:

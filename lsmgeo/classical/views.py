@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 
-from lsmgeo.cameras import CameraTensors
-from lsmgeo.classical.planes import longest_path
+from lsmgeo.cameras import CameraTensors, resize
 from lsmgeo.data import PosedImages
 from lsmgeo.errors import OptionError
+from lsmgeo.grids import FrustumGrid, depth_planes
 
-__all__ = ["camera_centers", "common_point", "default_depth_range", "number_of_planes", "select_neighbours"]
+__all__ = ["camera_centers", "common_point", "default_depth_range", "select_neighbours"]
 
 # Below the first angle a pair says little about depth, above the last its patches hardly look alike any more.
 SMALLEST_ANGLE, BEST_ANGLE, LARGEST_ANGLE = 1.5, 10.0, 60.0
 # Neighbours nearer to each other than this add no viewpoint.
 SMALLEST_SPACING = 1.0
+# A view that shares fewer sparse points, or less of the frustum, sees something else.
+LEAST_SHARED_POINTS, LEAST_SHARED_FRUSTUM = 5, 0.2
+FRUSTUM_SHAPE = (6, 6, 8)
+# Fewer depths do not tell a range.
+LEAST_DEPTHS = 10
 
 
 def camera_centers(cameras: CameraTensors) -> np.ndarray:
@@ -36,37 +43,49 @@ def common_point(cameras: CameraTensors) -> np.ndarray:
     return np.linalg.pinv(projectors.sum(0), rcond=1e-6) @ right
 
 
-def select_neighbours(scene: PosedImages, view: int, count: int) -> list[int]:
+def select_neighbours(
+    scene: PosedImages, view: int, count: int, *, near: float | None = None, far: float | None = None
+) -> list[int]:
     """Choose the views to match with a reference view.
 
-    Candidates are ranked by the angle under which both see the same thing, best near 10 degrees, times the number of
-    shared sparse points where the scene has any; the angle is the median over those points, else that at the point
-    where the optical axes meet. A view that stands where an already chosen one stands is passed over. (Score after
-    Yao et al., "MVSNet", ECCV 2018, section 4.1.)
+    Candidates are ranked by the angle under which both see the same thing, best near 10 degrees, times how much they
+    share: sparse points where the scene has any, else places all over the reference's frustum that the other view sees
+    too. The angle is the median over these. A view that stands where an already chosen one stands is passed over.
+    (Score after Yao et al., "MVSNet", ECCV 2018, section 4.1.)
 
     Args:
         scene: the posed photographs.
         view: index of the reference.
         count: how many are wanted.
+        near: nearest depth of what the reference sees, world units; by default `default_depth_range`.
+        far: farthest depth.
 
     Returns:
         At most ``count`` indices, best first.
 
     Raises:
-        OptionError: fewer than two other views are usable.
+        OptionError: no other view is usable, or the depth range is needed and cannot be told.
     """
     centers = camera_centers(scene.cameras)
-    focus = common_point(scene.cameras)
+    frustum = np.empty((0, 3))
+    if scene.points is None:
+        if near is None or far is None:
+            near, far = default_depth_range(scene, view)
+        frustum = _frustum_points(scene, view, near, far)
     scores, angles = {}, {}
     for other in range(len(scene)):
         if other == view:
             continue
-        points, weight = focus[None], 1.0
         if scene.points is not None:
             shared = np.intersect1d(scene.points.observations[view].points, scene.points.observations[other].points)
-            if len(shared) < 5:
-                continue
             points, weight = scene.points.positions[shared], float(len(shared))
+            if weight < LEAST_SHARED_POINTS:
+                continue
+        else:
+            points = frustum[_is_seen(scene, other, frustum)]
+            weight = len(points) / len(frustum)
+            if weight < LEAST_SHARED_FRUSTUM:
+                continue
         angle = float(np.median(_angles(centers[view], centers[other], points)))
         if SMALLEST_ANGLE < angle < LARGEST_ANGLE:
             spread = 5.0 if angle < BEST_ANGLE else 20.0
@@ -79,34 +98,62 @@ def select_neighbours(scene: PosedImages, view: int, count: int) -> list[int]:
             chosen.append(other)
         if len(chosen) == count:
             break
-    if len(chosen) < 2:
+    if not chosen:
         raise OptionError(
-            f"view {view} ({scene.names[view]}) has {len(chosen)} usable neighbours; matching needs at least 2 that "
-            f"see the same from {SMALLEST_ANGLE} to {LARGEST_ANGLE} degrees aside"
+            f"view {view} ({scene.names[view]}) has no usable neighbour: no other view sees the same from "
+            f"{SMALLEST_ANGLE} to {LARGEST_ANGLE} degrees aside"
         )
     return chosen
 
 
-def default_depth_range(scene: PosedImages, view: int, neighbours: list[int]) -> tuple[float, float]:
+def _frustum_points(scene: PosedImages, view: int, near: float, far: float) -> np.ndarray:
+    """World points (N, 3) all over a view's frustum, evenly in the picture and in inverse depth."""
+    camera = resize(scene.camera(view), *FRUSTUM_SHAPE[1:])
+    depths = depth_planes(near, far, FRUSTUM_SHAPE[0], spacing="inverse")
+    return FrustumGrid(camera, depths, FRUSTUM_SHAPE[1:]).centers().reshape(-1, 3).double().numpy()
+
+
+def _is_seen(scene: PosedImages, view: int, points: np.ndarray) -> np.ndarray:
+    """Which world points (N, 3) lie in a view's picture, (N,) bool."""
+    K, E = (value[view].double().numpy() for value in scene.cameras[:2])
+    image = (points @ E[:3, :3].T + E[:3, 3]) @ K.T
+    z = np.where(image[:, 2] > 0, image[:, 2], np.nan)
+    with np.errstate(invalid="ignore"):
+        pixels = image[:, :2] / z[:, None]
+        height, width = scene.size(view)
+        return np.asarray(((pixels > -0.5) & (pixels < (width - 0.5, height - 0.5))).all(1))
+
+
+def default_depth_range(scene: PosedImages, view: int, neighbours: Sequence[int] | None = None) -> tuple[float, float]:
     """Nearest and farthest depth to sweep in a view when nobody says.
 
-    From the sparse points that the view observes (their 2nd and 98th percentile, widened) where there are enough, else
-    around the point where the optical axes of the view and its neighbours meet: what lies there fills the pictures, so
-    its size is about that of the field of view at that depth.
+    From the sparse points that the view observes (their 2nd and 98th percentile, widened) where there are enough, or
+    from the depth that comes with the photograph, else around the point where the optical axes meet: what lies there
+    fills the pictures, so its size is about that of the field of view at that depth.
+
+    Args:
+        scene: the posed photographs.
+        view: index of the view.
+        neighbours: the views whose optical axes count; by default all.
 
     Raises:
         OptionError: the depth cannot be told; ``near`` and ``far`` must be given.
+        DataError: the depth that comes with the photograph cannot be read.
     """
     E = scene.cameras.cam_from_world[view].double().numpy()
+    depth = np.empty(0)
     if scene.points is not None:
         seen = scene.points.positions[scene.points.observations[view].points]
         depth = seen @ E[2, :3] + E[2, 3]
-        depth = depth[depth > 0]
-        if len(depth) >= 10:
-            low, high = np.percentile(depth, (2, 98))
-            margin = 0.25 * (high - low) + 0.02 * low
-            return float(max(low - margin, 0.5 * low)), float(high + margin)
-    focus = common_point(CameraTensors(*(value[[view, *neighbours]] for value in map(torch.as_tensor, scene.cameras))))
+    elif (measured := scene.load_depth(view)) is not None:
+        depth = measured.double().flatten().numpy()
+    depth = depth[depth > 0]
+    if len(depth) >= LEAST_DEPTHS:
+        low, high = np.percentile(depth, (2, 98))
+        margin = 0.25 * (high - low) + 0.02 * low
+        return float(max(low - margin, 0.5 * low)), float(high + margin)
+    looking = slice(None) if neighbours is None else [view, *neighbours]
+    focus = common_point(CameraTensors(*(value[looking] for value in map(torch.as_tensor, scene.cameras))))
     middle = float(E[2, :3] @ focus + E[2, 3])
     if not middle > 0:
         raise OptionError(f"view {view}: the cameras look at no common point; give near and far")
@@ -115,17 +162,6 @@ def default_depth_range(scene: PosedImages, view: int, neighbours: list[int]) ->
     radius = 0.75 * middle * min(0.5 * width / K[0, 0], 0.5 * height / K[1, 1])
     radius = min(radius, 0.5 * middle)
     return middle - radius, middle + radius
-
-
-def number_of_planes(cameras: CameraTensors, near: float, far: float) -> int:
-    """Planes so that one step moves a sample by about a pixel in the view that moves it most, 32 to 256.
-
-    Args:
-        cameras: leading shape (V,), the reference first, at the size at which they are matched.
-        near: first depth.
-        far: last depth.
-    """
-    return int(np.clip(np.ceil(longest_path(cameras, near, far)) + 1, 32, 256))
 
 
 def _angles(first: np.ndarray, second: np.ndarray, points: np.ndarray) -> np.ndarray:

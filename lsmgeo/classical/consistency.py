@@ -1,0 +1,117 @@
+"""Whether the depth maps of several views agree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lsmgeo import functional
+from lsmgeo.cameras import CameraTensors
+from lsmgeo.errors import OptionError, ShapeError
+
+__all__ = ["consistent_views"]
+
+
+def consistent_views(
+    depth: Tensor,
+    camera: CameraTensors,
+    other_depths: Sequence[Tensor],
+    other_cameras: Sequence[CameraTensors],
+    *,
+    pixels: float = 1.0,
+    relative: float = 0.01,
+) -> Tensor:
+    """Count the other depth maps that agree with one, pixel by pixel.
+
+    Equation: the point X of pixel p at depth d is seen in the other view at q; the point that the other map has at q,
+    seen back in the first view, lies at p' with depth d'. They agree where ``|p' - p| <= pixels`` and
+    ``|d' - d| <= relative d`` (Yao et al., "MVSNet", ECCV 2018, section 4.2). The other map is read between its pixels
+    by interpolating inverse depth, which is exact on planes, and where one of the four has no depth, not at all.
+
+    Convention:
+        Depth is camera z, 0 where there is none. Integer pixel centres.
+
+    Args:
+        depth: (h, w) of the view that is checked.
+        camera: its camera, leading shape (), of images of that size.
+        other_depths: (h', w') each, of any size.
+        other_cameras: their cameras, of images of their sizes.
+        pixels: largest distance of the pixel that comes back.
+        relative: largest difference of the depth that comes back, as a fraction.
+
+    Returns:
+        (h, w) int64, from 0 to the number of other views; 0 where `depth` is. Not differentiable.
+
+    Raises:
+        ShapeError: as many cameras as depth maps are needed, and each map must be (h, w).
+        OptionError: a tolerance that is not positive.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.cameras import CameraTensors
+        >>> from lsmgeo.classical import consistent_views
+        >>> K = torch.tensor([[4.0, 0.0, 1.5], [0.0, 4.0, 1.0], [0.0, 0.0, 1.0]])
+        >>> E = torch.eye(4)
+        >>> moved = E.clone()
+        >>> moved[0, 3] = -0.5  # one pixel at depth 2
+        >>> wall = torch.full((3, 4), 2.0)
+        >>> first, second = CameraTensors(K, E, 3, 4), CameraTensors(K, moved, 3, 4)
+        >>> consistent_views(wall, first, [wall], [second])
+        tensor([[0, 1, 1, 1],
+                [0, 1, 1, 1],
+                [0, 1, 1, 1]])
+    """
+    if len(other_depths) != len(other_cameras):
+        raise ShapeError(
+            f"consistent_views: other_cameras must be as many as other_depths, {len(other_depths)}; "
+            f"got {len(other_cameras)}"
+        )
+    for name, value in (("depth", depth), *(("other_depths", other) for other in other_depths)):
+        if value.ndim != 2:
+            raise ShapeError(f"consistent_views: {name} must be (h, w); got {tuple(value.shape)}")
+    for name, number in (("pixels", pixels), ("relative", relative)):
+        if not number > 0:
+            raise OptionError(f"consistent_views: {name} must be positive; got {number}")
+    height, width = depth.shape
+    with torch.no_grad():
+        y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        own = torch.stack((x, y), -1).reshape(-1, 2).double()
+        start, known = depth.double().reshape(-1), depth.reshape(-1) > 0
+        points = _points(camera, own, start)
+        count = torch.zeros(height * width, dtype=torch.int64)
+        for other, seen_by in zip(other_depths, other_cameras, strict=True):
+            place, z = _pixels(seen_by, points)
+            found = _depth_at(other, place, z, known)
+            back, distance = _pixels(camera, _points(seen_by, place, found))
+            agree = ((back - own).norm(dim=-1) <= pixels) & ((distance - start).abs() <= relative * start)
+            count += known & (found > 0) & agree
+        return count.reshape(height, width)
+
+
+def _points(camera: CameraTensors, pixels: Tensor, depth: Tensor) -> Tensor:
+    """World points (N, 3) of pixels (N, 2) at camera z (N,)."""
+    K, E = camera.intrinsics.double(), camera.cam_from_world.double()
+    rays = torch.linalg.solve(K, torch.cat((pixels, torch.ones_like(pixels[:, :1])), -1).T).T
+    return (depth[:, None] * rays - E[:3, 3]) @ E[:3, :3]
+
+
+def _pixels(camera: CameraTensors, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (N, 2) and camera z (N,) of world points; the pixel of a point that is not in front means nothing."""
+    K, E = camera.intrinsics.double(), camera.cam_from_world.double()
+    seen = (points @ E[:3, :3].T + E[:3, 3]) @ K.T
+    z = seen[:, 2]
+    return seen[:, :2] / torch.where(z > 0, z, 1.0)[:, None], z
+
+
+def _depth_at(depth: Tensor, pixels: Tensor, z: Tensor, known: Tensor) -> Tensor:
+    """Depth (N,) of a map between its pixels, 0 where one of the four around has none."""
+    has = depth > 0
+    layers = torch.stack((torch.where(has, 1 / torch.where(has, depth, 1.0), 0.0), has.to(depth.dtype)))
+    # Fused depths are float32; the interpolation of their inverses is not, so that planes stay planes.
+    sampled = functional.sample_views(
+        layers.double()[None, None], pixels[None, None], z[None, None], (known & (z > 0))[None, None]
+    ).volume[0, 0]
+    whole = sampled[1] > 1 - 1e-9
+    return torch.where(whole, 1 / torch.where(whole, sampled[0], 1.0), 0.0)

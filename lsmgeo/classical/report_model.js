@@ -1,0 +1,79 @@
+// Runs after the page of trimesh, whose variables camera, controls, scene, renderer and function render it uses.
+function lookFrom(place, forward, up, field) {
+  const distance = Math.max(0.1, -(place[0] * forward[0] + place[1] * forward[1] + place[2] * forward[2]));
+  camera.fov = field;
+  camera.up.set(...up);
+  camera.position.set(...place);
+  controls.target.set(...place.map((value, axis) => value + distance * forward[axis]));
+  camera.lookAt(controls.target);
+  camera.updateProjectionMatrix();
+  controls.update();
+  render();
+}
+
+function lookAtStart() {
+  // A window higher than wide sees less to the sides.
+  lookFrom([0, 0, settings.distance / Math.min(1, camera.aspect)], [0, 0, -1], [0, 1, 0], settings.field);
+}
+
+function lookAsView(view) {
+  const stand = settings.stands[view];
+  lookFrom(stand.slice(0, 3), stand.slice(3, 6), stand.slice(6, 9), Math.min(100, stand[9]));
+}
+
+function shade(shaded) {
+  scene.traverse((part) => {
+    if (!part.isMesh) return;
+    const material = shaded ? THREE.MeshLambertMaterial : THREE.MeshBasicMaterial;
+    part.material = new material({ vertexColors: true, side: THREE.DoubleSide });
+  });
+  render();
+}
+
+function addTools() {
+  const tools = document.createElement("div");
+  tools.id = "tools";
+  const addBox = (name, checked, change) => {
+    const label = document.createElement("label");
+    const box = document.createElement("input");
+    box.type = "checkbox";
+    box.checked = checked;
+    box.onchange = () => change(box.checked);
+    label.append(box, " " + name);
+    tools.append(label);
+    change(checked);
+  };
+  const hasMesh = scene.getObjectByName("mesh") !== undefined;
+  for (const name of ["mesh", "points", "cameras"]) {
+    const part = scene.getObjectByName(name);
+    if (part === undefined) continue;
+    // Points lie on the mesh, and would hide it.
+    addBox(name, name !== "points" || !hasMesh, (shown) => { part.visible = shown; render(); });
+  }
+  if (hasMesh) addBox("shading", settings.shaded, shade);
+  const button = document.createElement("button");
+  button.textContent = "start view";
+  button.onclick = lookAtStart;
+  tools.append(button);
+  document.body.append(tools);
+}
+
+function begin() {
+  if (camera === undefined || controls === undefined) {
+    requestAnimationFrame(begin);
+    return;
+  }
+  camera.near = 0.005;
+  camera.far = 10000;
+  controls.rotateSpeed = 2.5;
+  scene.add(new THREE.AmbientLight(0xffffff, 0.35));
+  tracklight.intensity = 0.75;
+  scene.traverse((part) => {
+    if (part.isPoints) part.material = new THREE.PointsMaterial({ size: 2.5, sizeAttenuation: false, vertexColors: true });
+  });
+  addTools();
+  lookAtStart();
+  document.body.dataset.ready = "yes";
+}
+
+begin();

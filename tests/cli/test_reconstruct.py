@@ -106,7 +106,7 @@ def _fits(memory):
         (["--view", "nobody.png"], "a photograph's name; got 'nobody.png'"),
         (["--density", "0"], "density must lie in"),
         (["--density", "2"], "density must lie in (0, 1]; got 2.0"),
-        (["--neighbours", "1"], "neighbours must be at least 2"),
+        (["--neighbours", "0"], "neighbours must be at least 1"),
         (["--size", "3"], "size must be at least 16"),
         (["--size", "0"], "size must be at least 16; got 0"),
         (["--planes", "2"], "planes must be at least 3"),
@@ -155,12 +155,20 @@ def test_a_missing_scene_gives_one_line_and_status_2(tmp_path, capsys):
     assert capsys.readouterr().err == f"lsmgeo: error: {tmp_path / 'nowhere'}: no such file or folder\n"
 
 
-def test_two_photographs_are_too_few(scene, tmp_path, capsys):
+def test_two_photographs_are_enough(scene, tmp_path):
     file = write_middlebury(scene, tmp_path) / "scene_par.txt"
     lines = file.read_text().splitlines()
     file.write_text("\n".join(["2", *lines[1:3]]))
-    assert cli.main(["reconstruct", str(tmp_path)]) == 2
-    assert "has 1 usable neighbours; matching needs at least 2" in capsys.readouterr().err
+    assert cli.main(["reconstruct", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
+    check_depth(np.load(tmp_path / "out" / "depth.npy"), scene.depth[0])
+
+
+def test_one_photograph_is_too_few(scene, tmp_path, capsys):
+    file = write_middlebury(scene, tmp_path) / "scene_par.txt"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join(["1", *lines[1:2]]))
+    assert cli.main(["reconstruct", str(tmp_path), "--near", "1", "--far", "3"]) == 2
+    assert "has no usable neighbour" in capsys.readouterr().err
 
 
 def test_views_are_chosen_by_angle_and_not_twice(scene, tmp_path):

@@ -112,7 +112,7 @@ def fuse_depth(
         for view, given in enumerate(zip(*columns, strict=True)):
             maps = _checked(who, view, *given)
             if sums is None:
-                sums = _Sums(grid, maps.depth, colours is not None)
+                sums = _Sums(grid, maps.depth, coloured=colours is not None)
             elif maps.depth.dtype != sums.distance.dtype:
                 raise DTypeError(f"{who}: depths must be of one dtype; got {sums.distance.dtype}, {maps.depth.dtype}")
             _fuse_view(sums, maps, select(tensors, 0, view), grid, truncation, memory)
@@ -137,7 +137,7 @@ class _Maps(NamedTuple):
 class _Sums:
     """Running sums over the views."""
 
-    def __init__(self, grid: VoxelGrid, like: Tensor, coloured: bool) -> None:
+    def __init__(self, grid: VoxelGrid, like: Tensor, *, coloured: bool) -> None:
         self.distance = like.new_zeros(grid.shape)
         self.weight = torch.zeros_like(self.distance)
         self.colours = like.new_zeros((3, *grid.shape)) if coloured else None  # type: ignore[misc]
@@ -154,40 +154,57 @@ def _fuse_view(
     sums: _Sums, maps: _Maps, camera: CameraTensors, grid: VoxelGrid, truncation: float, memory: int
 ) -> None:
     height, width = maps.depth.shape
-    smooth, nearest = _feature_maps(maps, resize(camera, height, width), truncation)
+    camera = resize(camera, height, width)
+    smooth, nearest = _feature_maps(maps, camera, truncation)
     planes = _slab_planes(grid, smooth, memory)
     views, augment = stack([camera]), ("depth", "direction")
     interpolated = functional.unproject_slabs(
         smooth, views, grid, planes, padding_mode="border", augment=augment, direction_frame="camera"
     )
     taken = functional.unproject_slabs(nearest, views, grid, planes, mode="nearest", padding_mode="border")
-    for (start, between, visible), (_, exact, _) in zip(interpolated, taken, strict=True):
-        seen = visible[0, 0]
-        if not bool(seen.any()):
-            continue
-        between, exact = between[0, 0], exact[0, 0]
-        here = slice(start, start + planes)
-        is_rough = between[1] > 0
-        inverse = torch.where(is_rough, exact[0], between[0])
-        z, along = between[-4], between[-1]  # camera z, and z of the unit direction
-        known = seen & (exact[0] > 0) & (inverse > 0)
-        distance = (1 / torch.where(known, inverse, 1) - z) / along.clamp_min(1e-6)
-        known &= distance > -truncation
-        weight = exact[1] * (1 + distance / truncation).clamp(0, 1).square() * known
-        value = distance.clamp_max(truncation)
-        empty = seen & (exact[2] > 0)
-        weight = torch.where(empty, exact[1], weight)
-        value = torch.where(empty, truncation, value)
-        sums.distance[here] += torch.where(weight > 0, weight * value, 0)
-        sums.weight[here] += weight
-        if sums.colours is not None and sums.near is not None:
-            near = weight * (1 - value.abs() / truncation).clamp_min(0)
-            sums.colours[:, here] += torch.where(is_rough, exact[3:6], between[2:5]) * near
-            sums.near[here] += near
+    first = 0
+    for (_, between, visible), (_, exact, _) in zip(interpolated, taken, strict=True):
+        count = visible.numel()
+        seen = visible.flatten() & (exact[0, 0, 1] > 0).flatten()
+        at = seen.nonzero()[:, 0]  # of most views most voxels learn nothing
+        inverse, roughness, z, along = (between[0, 0, row].flatten().index_select(0, at) for row in (0, 1, 2, 5))
+        pixel, weight = (row.flatten().index_select(0, at) for row in exact[0, 0])
+        is_rough = roughness > 0
+        inverse = torch.where(is_rough, pixel, inverse)
+        # Where a ray hits nothing, inverse depth is 0 and the surface infinitely far.
+        distance = (1 / inverse - z) / along
+        near = distance > -truncation
+        at, distance, weight = at[near] + first, distance[near], weight[near]
+        weight = weight * (1 + distance / truncation).clamp(0, 1).square()
+        sums.distance.view(-1)[at] += weight * distance.clamp_max(truncation)
+        sums.weight.view(-1)[at] += weight
+        if maps.colours is not None:
+            close = distance < truncation
+            share = weight[close] * (1 - distance[close].abs() / truncation)
+            _add_colours(sums, maps.colours, views, grid, at[close], share, is_rough[near][close])
+        first += count
+
+
+def _add_colours(
+    sums: _Sums, colours: Tensor, views: CameraTensors, grid: VoxelGrid, at: Tensor, share: Tensor, is_rough: Tensor
+) -> None:
+    """Add what a view's picture shows at voxels ``at``, counted through the grid, times their shares of it."""
+    assert sums.colours is not None
+    assert sums.near is not None
+    _, height, width = grid.shape  # type: ignore[misc]
+    T = grid.world_from_lattice.to(at.device)
+    index = torch.stack((at % width, at // width % height, at // (width * height)), -1).to(T.dtype)
+    points = index @ T[:3, :3].T + T[:3, 3]
+    for mode, some in (("bilinear", ~is_rough), ("nearest", is_rough)):
+        seen = functional.unproject_points(
+            colours[None, None], views, points[some][None], mode=mode, padding_mode="border"
+        ).volume[0, 0]
+        sums.colours.view(3, -1)[:, at[some]] += seen * share[some]
+    sums.near.view(-1)[at] += share
 
 
 def _feature_maps(maps: _Maps, camera: CameraTensors, truncation: float) -> tuple[Tensor, Tensor]:
-    """What is interpolated: inverse depth, roughness, colours; and what is not: inverse depth, weight, emptiness."""
+    """What is interpolated: inverse depth and roughness; and what is not: inverse depth and weight, 0 if unknown."""
     depth = maps.depth
     has_depth = depth > 0
     inverse = torch.where(has_depth, 1 / torch.where(has_depth, depth, 1), 0)
@@ -196,15 +213,15 @@ def _feature_maps(maps: _Maps, camera: CameraTensors, truncation: float) -> tupl
     largest, smallest = max_pool2d(around, 3, 1), -max_pool2d(-around, 3, 1)
     rough = ((largest - smallest > truncation) | (smallest <= 0))[0, 0]
     weight = _cosine(inverse, camera)
-    empty = torch.zeros_like(depth)
     if maps.background is not None:
-        empty = -max_pool2d(-maps.background[None, None].to(depth.dtype), 3, 1, 1)[0, 0]
-        weight = torch.where(empty > 0, 1, weight)
+        # The largest of the negative is the least: a rim of one pixel is no background.
+        inner = -max_pool2d(-maps.background[None, None].to(depth.dtype), 3, 1, 1)[0, 0] > 0
+        inverse, weight = torch.where(inner, 0, inverse), torch.where(inner, 1, weight)
+        rough |= inner
     if maps.weights is not None:
         weight = weight * maps.weights
-    colours = () if maps.colours is None else tuple(maps.colours)
-    smooth = torch.stack((inverse, rough.to(depth.dtype), *colours))
-    nearest = torch.stack((inverse, weight, empty, *colours))
+    smooth = torch.stack((inverse, rough.to(depth.dtype)))
+    nearest = torch.stack((inverse, weight))
     return smooth[None, None], nearest[None, None]
 
 

@@ -7,10 +7,17 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-__all__ = ["Depths", "triangulate"]
+__all__ = ["Depths", "Features", "find_features", "triangulate"]
 
 RATIO = 0.75
 MOST_EPIPOLAR, LEAST_ANGLE = 1.0, 2.0  # px, degrees
+
+
+class Features(NamedTuple):
+    """SIFT features of one picture."""
+
+    pixels: np.ndarray  # (N, 2) x, y, integer centres
+    descriptors: np.ndarray  # (N, 128)
 
 
 class Depths(NamedTuple):
@@ -20,7 +27,15 @@ class Depths(NamedTuple):
     depth: np.ndarray  # (N,) camera z
 
 
-def triangulate(pictures: list[np.ndarray], K: np.ndarray, E: np.ndarray, reference: int) -> Depths:
+def find_features(picture: np.ndarray) -> Features:
+    """The features of a (h, w) uint8 picture."""
+    # Without precise upscaling SIFT's coordinates are a quarter of a pixel off.
+    finder = cv2.SIFT_create(nfeatures=8000, contrastThreshold=0.02, enable_precise_upscale=True)  # type: ignore[attr-defined]
+    points, descriptors = finder.detectAndCompute(picture, None)
+    return Features(np.array([point.pt for point in points]).reshape(-1, 2), descriptors)
+
+
+def triangulate(features: list[Features], K: np.ndarray, E: np.ndarray, reference: int) -> Depths:
     """The depths in one view of the features that others share with it.
 
     A feature counts where its matches lie within a pixel of their epipolar lines, all of them within a pixel of the
@@ -28,18 +43,17 @@ def triangulate(pictures: list[np.ndarray], K: np.ndarray, E: np.ndarray, refere
     least-squares solution (DLT; Hartley and Zisserman, Multiple View Geometry, section 12.2) over its views.
 
     Args:
-        pictures: (h, w) uint8 of all views.
+        features: of all views.
         K: (V, 3, 3).
         E: (V, 4, 4) world-to-camera.
         reference: the view whose depths are wanted.
     """
-    features = [_features(picture) for picture in pictures]
     seen: dict[int, list[tuple[int, np.ndarray]]] = {}
-    for other in range(len(pictures)):
+    for other in range(len(features)):
         if other == reference:
             continue
-        for first, second in _matches(features[reference][1], features[other][1]):
-            pixel, pixel_other = features[reference][0][first], features[other][0][second]
+        for first, second in _matches(features[reference].descriptors, features[other].descriptors):
+            pixel, pixel_other = features[reference].pixels[first], features[other].pixels[second]
             if _epipolar_error(pixel, pixel_other, K, E, reference, other) < MOST_EPIPOLAR:
                 seen.setdefault(int(first), []).append((other, pixel_other))
     P = K @ E[:, :3]
@@ -47,7 +61,7 @@ def triangulate(pictures: list[np.ndarray], K: np.ndarray, E: np.ndarray, refere
     pixels, depths = [], []
     for first, found in seen.items():
         views = [reference, *(other for other, _ in found)]
-        places = np.array([features[reference][0][first], *(pixel for _, pixel in found)])
+        places = np.array([features[reference].pixels[first], *(pixel for _, pixel in found)])
         point = _point(P[views], places)
         image = P[views] @ np.append(point, 1.0)
         error = np.linalg.norm(image[:, :2] / image[:, 2:] - places, axis=1).max()
@@ -58,13 +72,6 @@ def triangulate(pictures: list[np.ndarray], K: np.ndarray, E: np.ndarray, refere
             pixels.append(places[0])
             depths.append(E[reference, 2, :3] @ point + E[reference, 2, 3])
     return Depths(np.array(pixels).reshape(-1, 2), np.array(depths))
-
-
-def _features(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    # Without precise upscaling SIFT's coordinates are a quarter of a pixel off.
-    finder = cv2.SIFT_create(nfeatures=8000, contrastThreshold=0.02, enable_precise_upscale=True)  # type: ignore[attr-defined]
-    points, descriptors = finder.detectAndCompute(picture, None)
-    return np.array([point.pt for point in points]).reshape(-1, 2), descriptors
 
 
 def _matches(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -46,6 +46,43 @@ def test_the_sweep_meets_the_sphere_within_a_tenth_of_a_plane(run):
     assert names["error"][names["surface"]].max() < 0.1 * names["spacing"]
 
 
+def test_a_sweep_of_photographs_is_right_to_a_thousandth_and_knows_where(run):
+    names = run("plane_sweep_stereo")
+    assert float(names["relative"].median()) < 1e-3
+    rates = names["curve"].error
+    assert float(rates[:7].max()) < 0.01 < float(rates[8])
+    # The camera that cannot see the place disagrees at its depth, and the better half does not mind.
+    place = (int((names["planes"] - names["truth"][names["row"], names["column"]]).abs().argmin()), 60, 115)
+    assert float(names["costs"][1][place]) > 1
+    assert float(names["cost"][place]) < 0.05
+
+
+def test_planes_a_pixel_apart_are_nearly_enough_and_depths_out_of_range_are_lost(run):
+    names = run("depth_range")
+    inverse, depth = names["curves"]["inverse"], names["curves"]["depth"]
+    assert 16 < names["told"] < 32
+    assert inverse[0] > 0.5 > 2 * inverse[2]
+    assert inverse[2] - inverse[4] < 0.03
+    assert all(even < uneven for even, uneven in zip(inverse[:4], depth[:4], strict=True))
+    lost = {name: names["off_by"](found, 0.05) for name, found in names["maps"].items()}
+    least = lost["as it is"]
+    assert least < 0.1
+    assert lost["near too far"] > 0.5
+    assert lost["far too near"] > 0.25
+    assert lost["ten times too wide"] > 2 * least
+    assert lost["ten times too wide, 75 planes"] < 1.2 * least
+
+
+def test_a_hull_nears_the_filled_cup_and_never_the_cup(run):
+    names = run("visual_hull")
+    hollow = names["filled"] & ~names["solid"]
+    overlaps = [float(names["metrics"].voxel_iou(hull.occupancy, names["filled"])) for hull in names["hulls"].values()]
+    assert overlaps == sorted(overlaps)
+    assert overlaps[-1] > 0.98
+    assert all(bool(hull.occupancy[hollow].all()) for hull in names["hulls"].values())
+    assert float(names["metrics"].voxel_iou(names["hulls"][24].occupancy, names["solid"])) < 0.4
+
+
 def test_two_degrees_of_pose_noise_fall_below_a_fifth_of_a_degree(run):
     names = run("pose_noise")
     assert abs(names["errors"][0] - 2.0).max() < 1e-3

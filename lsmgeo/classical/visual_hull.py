@@ -22,8 +22,8 @@ from lsmgeo.grids import VoxelGrid
 __all__ = ["VisualHull", "default_grid", "hull_box", "visual_hull"]
 
 RULES = ("mean", "all")
-# Bytes that a slab may take for every site and view: what is told of visibility, and the running statistics.
-BYTES_OF_A_VIEW, BYTES_OF_A_SITE = 2, 32
+# Bytes that a slab takes for every site, at the worst moment.
+BYTES_OF_A_SITE = 32
 # Voxels along an axis of the coarse hulls from which a box is told, and how often it is told anew.
 COARSE, ROUNDS, GROWTHS = 32, 3, 4
 
@@ -39,7 +39,7 @@ class VisualHull(NamedTuple):
 
 
 def visual_hull(
-    masks: Tensor,
+    masks: Tensor | Sequence[Tensor],
     cameras: Cameras,
     grid: VoxelGrid,
     *,
@@ -60,8 +60,9 @@ def visual_hull(
         Integer pixel centres; masks of another size than the camera's image are resized for.
 
     Args:
-        masks: (V, h, w) or (B, V, h, w): bool, or numbers that are larger on the object: a soft silhouette, or a
-            distance to its outline (see `lsmgeo.classical.signed_distance`), with a threshold of its own.
+        masks: (V, h, w) or (B, V, h, w), or V of any sizes (h, w): bool, or numbers that are larger on the object: a
+            soft silhouette, or a distance to its outline (see `lsmgeo.classical.signed_distance`), with a threshold of
+            its own.
         cameras: V cameras, or (B, V).
         grid: any; with one pose a scene where masks have a batch.
         rule: "mean" or "all".
@@ -95,45 +96,63 @@ def visual_hull(
     threshold = {"mean": 0.75, "all": 0.5}[rule] if threshold is None else threshold
     check_number(who, "threshold", threshold, "a number")
     check_whole(who, "memory", memory, 1)
-    if not isinstance(masks, Tensor):
-        raise DTypeError(f"{who}: masks must be a tensor (V, h, w) or (B, V, h, w); got {describe(masks)}")
-    if masks.dim() not in (3, 4):
-        raise ShapeError(f"{who}: masks must be (V, h, w) or (B, V, h, w); got {tuple(masks.shape)}")
     if not isinstance(grid, VoxelGrid):
         raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
-    values = masks if masks.is_floating_point() else masks.float()
-    check_geometry(who, "masks", values, "(V, h, w) or (B, V, h, w)")
-    batched = values if values.dim() == 4 else values[None]
-    scenes, views = batched.shape[:2]
-    # The least over the views is minus the largest of minus; elsewhere the sign changes nothing.
-    sign = -1.0 if rule == "all" else 1.0
+    has_batch = isinstance(masks, Tensor) and masks.dim() == 4
+    maps = _maps_of_views(who, masks)
+    tensors = as_tensors(cameras, who)
+    leading = tuple(tensors.intrinsics.shape[:-2])
+    expected = (len(maps[0]), len(maps)) if has_batch else (len(maps),)
+    if leading != expected:
+        raise ShapeError(f"{who}: cameras must have the leading shape {expected}, as masks; got {leading}")
+    scenes, views = len(maps[0]), len(maps)
     _, height, width = grid.shape  # type: ignore[misc]
-    planes = max(1, memory // (scenes * height * width * (BYTES_OF_A_VIEW * views + BYTES_OF_A_SITE)))
-    support = batched.new_zeros((scenes, *grid.shape))  # type: ignore[misc]
+    planes = max(1, memory // (BYTES_OF_A_SITE * scenes * height * width))
+    # What lies off every silhouette: 0, or the least that any mask says where masks are distances.
+    nothing = min(0.0, *(float(values.min()) for values in maps))
+    start = float("inf") if rule == "all" else 0.0
+    support = maps[0].new_full((scenes, *grid.shape), start)  # type: ignore[misc]
+    count = torch.zeros(support.shape, dtype=torch.int16) if outside == "unknown" else None
     with torch.no_grad():
-        slabs = functional.unproject_slabs(
-            sign * batched[:, :, None],
-            cameras,
-            grid,
-            planes,
-            mode=mode,
-            padding_mode="border",
-            reduce="max" if rule == "all" else "mean",
-        )
-        # What lies off every silhouette: 0, or the least that any mask says where masks are distances.
-        nothing = min(0.0, float(batched.min())) if batched.numel() else 0.0
-        for start, volume, visible in slabs:
-            said = sign * volume[:, 0]
-            count = visible.sum(1)
-            if outside == "unknown":
-                said = torch.where(count > 0, said, nothing)
-            elif rule == "all":
-                said = torch.where(count == views, said, nothing)
-            else:
-                said = (said * count + nothing * (views - count)) / views
-            support[:, start : start + planes] = said
-    support = support if masks.dim() == 4 else support[0]
+        # One view after another: its picture stays in the caches, and memory does not grow with the views.
+        for view, values in enumerate(maps):
+            camera = stack([select(tensors, len(leading) - 1, view)], len(leading) - 1)
+            features = values[:, None, None]
+            for first, volume, visible in functional.unproject_slabs(
+                features, camera, grid, planes, mode=mode, padding_mode="border"
+            ):
+                said, seen = volume[:, 0, 0], visible[:, 0]
+                here = support[:, first : first + planes]
+                if count is not None:
+                    count[:, first : first + planes] += seen
+                elsewhere = nothing if outside == "empty" else start
+                said = torch.where(seen, said, elsewhere)
+                here.copy_(torch.minimum(here, said) if rule == "all" else here + said)
+    if rule == "mean":
+        support /= views if count is None else count.clamp_min(1)
+    if count is not None:
+        support[count == 0] = nothing
+    support = support if has_batch else support[0]
     return VisualHull(support > threshold, support)
+
+
+def _maps_of_views(who: str, masks: Tensor | Sequence[Tensor]) -> list[Tensor]:
+    """(B, h, w) numbers of every view."""
+    if isinstance(masks, Tensor):
+        if masks.dim() not in (3, 4) or 0 in masks.shape:
+            raise ShapeError(f"{who}: masks must be (V, h, w) or (B, V, h, w); got {tuple(masks.shape)}")
+        views = list(masks.unbind(1)) if masks.dim() == 4 else [mask[None] for mask in masks]
+    elif isinstance(masks, Sequence) and masks and all(isinstance(mask, Tensor) for mask in masks):
+        if not all(mask.dim() == 2 and mask.numel() for mask in masks):
+            shapes = [tuple(mask.shape) for mask in masks]
+            raise ShapeError(f"{who}: masks of single views must be (h, w); got {shapes}")
+        views = [mask[None] for mask in masks]
+    else:
+        raise DTypeError(f"{who}: masks must be a tensor (V, h, w) or (B, V, h, w), or a list; got {describe(masks)}")
+    numbers = [view.float() if view.dtype == torch.bool else view for view in views]
+    for view in numbers:
+        check_geometry(who, "masks", view, "(V, h, w) or (B, V, h, w), bool or")
+    return numbers
 
 
 def hull_box(

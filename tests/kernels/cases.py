@@ -48,10 +48,10 @@ MASK = torch.tensor([[True, True, False], [True, False, True]])
 WEIGHT, BIAS = _random(4, C * 5), _random(4)
 
 
-def frustum() -> FrustumGrid:
+def frustum(size: tuple[int, int] = SIZE) -> FrustumGrid:
     """Projective, with depths of their own for each scene."""
     reference = CameraTensors(*(field[:, 0] for field in VIEWS))
-    return FrustumGrid(reference, torch.stack((DEPTHS, 1.1 * DEPTHS)), SIZE)
+    return FrustumGrid(reference, torch.stack((DEPTHS, 1.1 * DEPTHS)), size)
 
 
 def _both(**options: Any) -> dict[str, Any]:
@@ -79,6 +79,10 @@ CASES: dict[str, Callable[[str], None]] = {
         unproject_call, FEATURES, VIEWS, GRID, mode="nearest", padding_mode="border", view_mask=MASK, **_both()
     ),
     "frustum, masked": _case(unproject_call, FEATURES, VIEWS, frustum(), view_mask=MASK, **_both()),
+    # Vectors of sites, in rows longer than a tile and shorter.
+    "one channel": _case(unproject_call, FEATURES[:, :, :1], VIEWS, frustum((2, 70))),
+    "one channel, border": _case(unproject_call, FEATURES[:, :, :1], VIEWS, frustum((2, 70)), padding_mode="border"),
+    "one channel, nearest": _case(unproject_call, FEATURES[:, :, :1], VIEWS, GRID, mode="nearest", view_mask=MASK),
     "near": _case(unproject_call, FEATURES, VIEWS, GRID, near=1.6, padding_mode="border"),
     "mean": _case(unproject_call, WIDE, VIEWS, GRID, reduce="mean"),
     "variance": _case(unproject_call, WIDE, VIEWS, GRID, reduce="variance", padding_mode="border"),
@@ -103,6 +107,7 @@ HALF: dict[str, Callable[[str], None]] = {
         "statistics": _case(unproject_call, WIDE.to(dtype), VIEWS, GRID, reduce=("mean", "variance")),
         "trilinear": _case(sweep_call, WIDE_VOLUME.to(dtype), *SWEEP[1:], flat=5, padding_mode="border", **_both()),
         "pixels": _case(views_call, WIDE.to(dtype), PIXELS, DISTANCE, VALID),
+        "one channel": _case(unproject_call, FEATURES[:, :, :1].to(dtype), VIEWS, GRID, padding_mode="border"),
         "small numbers": _case(unproject_call, (1e-5 * WIDE).to(dtype), VIEWS, GRID, padding_mode="border"),
     }.items()
 }

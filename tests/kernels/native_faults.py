@@ -28,6 +28,9 @@ FAULTS = {
         "const float weight = weight_of<DIMS>(tile, s, tap) * factor;",
         "const float weight = factor;",
     ),
+    "one channel's tap astray": ("places[2][s] = corner + down;", "places[2][s] = corner;"),
+    "one channel's unread sites": ("values[s] = tile.reads[s] ? values[s] : 0.0f;", ""),
+    "one channel's rest forgotten": ("s < padded; s += LANES", "s + LANES <= n; s += LANES"),
     "tiles at the volume's edge passed over": (
         "if (index[axis][0] < -1.01 && index[axis][1] < -1.01) return true;",
         "if (index[axis][0] < 0.4 && index[axis][1] < 0.4) return true;",

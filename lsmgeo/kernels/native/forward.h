@@ -67,8 +67,12 @@ inline Block take(const Call &call, const Tile &tile, int64_t channel, int64_t c
 inline void show(const Call &call, const Tile &tile) {
     const int64_t *n = call.sites;
     const int64_t at = (((tile.scene * call.views + tile.view) * n[2] + tile.k) * n[1] + tile.j) * n[0] + tile.i;
-    const int64_t step = tile.along_z ? n[0] * n[1] : 1;
-    for (int64_t s = 0; s < tile.number; s++) call.visible[at + s * step] = tile.visible[s];
+    uint8_t *visible = call.visible + at;
+    const int number = int(tile.number);
+    if (tile.along_z)
+        for (int s = 0; s < number; s++) visible[s * n[0] * n[1]] = uint8_t(tile.visible[s]);
+    else
+        for (int s = 0; s < number; s++) visible[s] = uint8_t(tile.visible[s]);
 }
 
 // The channels that geometry gives: depth, direction, extras; `step` floats from one to the next.
@@ -164,6 +168,7 @@ void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_
     axis_strides(call.source_stride, axes);
     const S *source = source_of<S>(call, scene, view);
     const int64_t channels = plan.channels;
+    const Plain image = plain(call, axes);
     for (int64_t number = first; number < last; number++) {
         start(plan, tile, scene, view, number);
         const Layout at = layout(call.values_stride, tile);
@@ -176,6 +181,10 @@ void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_
         const bool direct = call.values_type == FLOAT32 && at.channel == 1;
         float *out = direct ? static_cast<float *>(call.values) + at.base : room.values;
         const int64_t step = direct ? at.site : channels;
+        if (DIMS == 2 && channels == 1 && step == 1 && image.fits && gather_row(call, tile, source, image, out)) {
+            if (!direct) put(call, at, tile.number, channels, room.values);
+            continue;
+        }
         for (int s = 0; s < int(tile.number); s++) {
             gather<DIMS>(call, tile, s, source, axes, call.channels, out + s * step);
             append(call, tile, s, out + s * step + call.channels);

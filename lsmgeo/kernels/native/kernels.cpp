@@ -20,6 +20,11 @@
 #include <sys/mman.h>
 #endif
 
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && !defined(LSMGEO_ONE_SET)
+#define VARIANTS 1
+#include <immintrin.h>
+#endif
+
 #include "call.h"
 
 #if defined(_WIN32)
@@ -65,8 +70,7 @@ namespace baseline {
 }
 
 // LSMGEO_ONE_SET builds the first alone, in a fraction of the time.
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && !defined(LSMGEO_ONE_SET)
-#define VARIANTS 1
+#if VARIANTS
 #pragma GCC push_options
 #pragma GCC target("avx2,fma,bmi2")
 #undef LANES

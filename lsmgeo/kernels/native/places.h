@@ -242,6 +242,53 @@ inline void gather(const Call &call, const Tile &tile, int s, const S *source, c
     }
 }
 
+// An image of one channel whose offsets take half the room in a vector.
+struct Plain { int32_t last_x, last_y, step_x, step_y; bool fits; };
+
+inline Plain plain(const Call &call, const int64_t *stride) {
+    const int64_t last_x = call.size[0] - 1, last_y = call.size[1] - 1;
+    const bool fits = last_x * stride[0] + last_y * stride[1] <= INT32_MAX;
+    return {int32_t(last_x), int32_t(last_y), int32_t(stride[0]), int32_t(stride[1]), fits};
+}
+
+// The values of one channel at all sites of a tile: vectors of sites, where channels make none. It declines, and does
+// nothing, where a site mixes pixels with what lies outside.
+template <class S>
+inline bool gather_row(const Call &call, const Tile &tile, const S *source, const Plain &image, float *out) {
+    const int n = int(tile.number), padded = (n + LANES - 1) / LANES * LANES;
+    int32_t places[4][TILE];
+    float values[TILE];
+    int32_t whole = 1;
+    for (int s = 0; s < n; s++) whole &= tile.whole[s];
+    if (!whole && !call.border && !call.nearest) return false;
+    for (int s = 0; s < n; s++) {
+        const bool reads = tile.reads[s] != 0;
+        const int32_t x = reads ? tile.cell[0][s] : 0, y = reads ? tile.cell[1][s] : 0;
+        // A tap beyond the border has no weight and looks at the corner, where a NaN counts in any case.
+        const int32_t corner = x * image.step_x + y * image.step_y;
+        const int32_t right = x < image.last_x ? image.step_x : 0, down = y < image.last_y ? image.step_y : 0;
+        places[0][s] = corner;
+        places[1][s] = corner + right;
+        places[2][s] = corner + down;
+        places[3][s] = corner + right + down;
+    }
+    const int taps = call.nearest ? 1 : 4;
+    for (int tap = 0; tap < taps; tap++)
+        for (int s = n; s < padded; s++) places[tap][s] = 0;
+    for (int s = 0; s < padded; s += LANES) {
+        Floats<LANES> value = read_at(source, places[0] + s);
+        if (!call.nearest) {
+            value *= read<LANES>(tile.weight[0] + s);
+            for (int tap = 1; tap < 4; tap++)
+                value += read<LANES>(tile.weight[tap] + s) * read_at(source, places[tap] + s);
+        }
+        write<LANES>(values + s, value);
+    }
+    for (int s = 0; s < n; s++) values[s] = tile.reads[s] ? values[s] : 0.0f;
+    std::memcpy(out, values, size_t(n) * sizeof(float));
+    return true;
+}
+
 template <int N>
 INLINE void spread(float *const *place, const float *weight, int64_t channels, const float *gradient) {
     over_channels(channels, [&](auto width, int64_t c) INLINED {

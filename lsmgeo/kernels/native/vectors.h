@@ -74,6 +74,22 @@ template <int W> INLINE Floats<W> read(const Float16 *place) {
 }
 template <int W> INLINE void write(float *place, Floats<W> values) { std::memcpy(place, &values, sizeof values); }
 
+// The numbers at these places: the compiler does not use the instruction for it by itself.
+template <class S> INLINE Floats<LANES> read_at(const S *first, const int32_t *places) {
+    Floats<LANES> values;
+    for (int lane = 0; lane < LANES; lane++) values[lane] = load(first[places[lane]]);
+    return values;
+}
+#if LANES == 8
+INLINE Floats<8> read_at(const float *first, const int32_t *places) {
+    return Floats<8>(_mm256_i32gather_ps(first, _mm256_loadu_si256(reinterpret_cast<const __m256i *>(places)), 4));
+}
+#elif LANES == 16
+INLINE Floats<16> read_at(const float *first, const int32_t *places) {
+    return Floats<16>(_mm512_i32gather_ps(_mm512_loadu_si512(places), first, 4));
+}
+#endif
+
 // Calls body(width, c) for vectors of channels from 0 to `channels`, wide ones first.
 template <class Body> INLINE void over_channels(int64_t channels, Body body) {
     int64_t c = 0;

@@ -146,3 +146,13 @@ def mistake_rows(cases: Sequence[Mapping[str, Any]]) -> Rows:
         said[case["set"], case["planted"]] = "named" if named else case["named"] or case["verdict"]
     sets = dict.fromkeys(case["set"] for case in cases)
     return [["set", *planted], *([name, *(said.get((name, mistake), "—") for mistake in planted)] for name in sets)]
+
+
+def reached_rows(cases: Sequence[Mapping[str, Any]]) -> Rows:
+    """What of, the figure, what was measured, what it was to reach, and whether it does."""
+    said = {True: "reached", False: "**missed**", None: ""}
+    rows = [["of", "figure", "measured", "goal", ""]]
+    for case in cases:
+        for row in case["rows"]:
+            rows.append([row["section"], row["what"], row["measured"], row["goal"] or "—", said[row["reached"]]])
+    return rows

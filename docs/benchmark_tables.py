@@ -29,7 +29,10 @@ TABLES: dict[str, Callable[[list[dict[str, Any]]], report.Rows]] = {
     "rates": report.rate_rows,
     "figures": report.figure_rows,
     "mistakes": report.mistake_rows,
+    "reached": report.reached_rows,
 }
+# Figures of the plot directive, and the results that they draw.
+PLOTS = {"benchmark_growth": "growth", "classical_density": "classical"}
 
 
 def load(name: str) -> dict[str, Any] | None:
@@ -68,10 +71,11 @@ class Benchmark(SphinxDirective):
 
 def forget_plots(app: Sphinx) -> None:
     """Remove plots that are older than their results: the plot directive looks at the age of the script alone."""
-    results = RESULTS / "growth.json"
-    for plot in (Path(app.doctreedir).parent / "plot_directive").rglob("benchmark_growth*"):
-        if results.is_file() and plot.stat().st_mtime < results.stat().st_mtime:
-            plot.unlink()
+    for name, drawn in PLOTS.items():
+        results = RESULTS / f"{drawn}.json"
+        for plot in (Path(app.doctreedir).parent / "plot_directive").rglob(f"{name}*"):
+            if results.is_file() and plot.stat().st_mtime < results.stat().st_mtime:
+                plot.unlink()
 
 
 def setup(app: Sphinx) -> dict[str, Any]:

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_number
-from lsmgeo.errors import OptionError, ShapeError
+from lsmgeo._checks import check_number, describe
+from lsmgeo.errors import DTypeError, OptionError, ShapeError
 from lsmgeo.metrics.depth import RADIUS, median_depth_error
 from lsmgeo.metrics.voxels import voxel_iou
 
@@ -41,6 +41,7 @@ def category_means(values: Tensor | Sequence[float], categories: Sequence[str]) 
 
     Raises:
         ShapeError: not as many values as names.
+        DTypeError: a category that is no name.
 
     Example:
         >>> from lsmgeo.metrics import category_means
@@ -223,8 +224,10 @@ def _collect(
     names = [categories] * len(numbers) if isinstance(categories, str) else list(categories)
     if len(names) != len(numbers):
         raise ShapeError(f"{who}: categories must be {len(numbers)} names, one a model; got {len(names)}")
+    if strange := [name for name in names if not isinstance(name, str)]:
+        raise DTypeError(f"{who}: categories must be names; got {describe(strange[0])}")
     for name, number in zip(names, numbers, strict=True):
-        collected.setdefault(str(name), []).append(number)
+        collected.setdefault(name, []).append(number)
 
 
 def _extend(collected: dict[str, list[float]], others: Mapping[str, Iterable[float]]) -> None:

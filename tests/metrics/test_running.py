@@ -14,7 +14,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lsmgeo.errors import OptionError, ShapeError
+from lsmgeo.errors import DTypeError, OptionError, ShapeError
 from lsmgeo.metrics import (
     DepthError,
     Running,
@@ -151,6 +151,8 @@ def test_errors_name_the_argument():
         DepthError().update(torch.ones(2, 3, 4), torch.ones(2, 3, 4))
     with pytest.raises(ShapeError, match=r"category_means: categories must be 2 names"):
         category_means([0.1, 0.2], ["car"])
+    with pytest.raises(DTypeError, match=r"VoxelIoU.update: categories must be names; got NoneType None"):
+        VoxelIoU().update(predicted, truth, ["car", None])
     with pytest.raises(OptionError, match=r"VoxelIoU.merge: other must have threshold"):
         VoxelIoU().merge(VoxelIoU(threshold=0.75))
     with pytest.raises(OptionError, match=r"DepthError.merge: other must have"):

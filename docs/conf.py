@@ -90,6 +90,16 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
 }
-without_siblings = ("index", "references", "conventions", "theory", "errors", "coming_from", "troubleshooting")
+without_siblings = (
+    "index",
+    "references",
+    "conventions",
+    "theory",
+    "errors",
+    "coming_from",
+    "troubleshooting",
+    "reconstruct",
+    "metrics",
+)
 html_sidebars = {page: [] for page in (*without_siblings, "formats/index")}
 html_show_sourcelink = False

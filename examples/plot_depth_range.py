@@ -7,7 +7,7 @@ What do these choices cost? Here the truth is known, so each can be tried.
 """
 
 # %%
-# Three cameras side by side look at a wall that runs from depth 1.5 at the left edge of the picture to depth 8 at the
+# Three cameras side by side look at a wall that runs from depth 1.5 at the left edge of the picture to depth 9 at the
 # right. Its paint is finer where it is near, so that all of it has texture.
 
 import math
@@ -56,10 +56,9 @@ curves = {
     for spacing in ("inverse", "depth")
 }
 told = len(sweep_planes(views, 1.4, 9.5, spacing="disparity"))
+print("planes: " + "".join(f"{number:8}" for number in numbers))
 for spacing, rates in curves.items():
-    print(
-        f"{spacing:>7}: " + ", ".join(f"{n} planes {100 * rate:.1f} %" for n, rate in zip(numbers, rates, strict=True))
-    )
+    print(f"{spacing:>7}:" + "".join(f"{100 * rate:6.1f} %" for rate in rates))
 print(f"a step is a pixel with {told} planes")
 
 # %%
@@ -76,7 +75,7 @@ ranges = {
 maps = {}
 for name, (near, far, number) in ranges.items():
     maps[name] = sweep(images, views, sweep_planes(views, near, far, number)).depth
-    print(f"{name:>30}, {near:g} to {far:g}: {100 * off_by(maps[name], 0.05):.1f} % are off by more than 5 %")
+    print(f"{name:>30}: {near:g} to {far:g}: {100 * off_by(maps[name], 0.05):.1f} % off by more than 5 %")
 
 figure, axes = plt.subplots(2, 3, figsize=(11.5, 5.2), layout="constrained")
 axes[0, 0].imshow(images[0].permute(1, 2, 0))

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from lsmgeo import VoxelGrid, cameras, data, metrics, scenes
-from lsmgeo.classical import extract_mesh, visual_hull
+from lsmgeo.classical import extract_mesh, signed_distance, visual_hull
 
 clay = scenes.Material((0.8, 0.55, 0.4))
 body = scenes.cone((0, 0.38, 0), (0, -0.2, 0), 0.34, 0.24, clay)
@@ -34,14 +34,16 @@ grid = VoxelGrid(64)
 solid, filled = (scenes.voxels([scene], grid)[0] for scene in (cup, full))
 
 # %%
-# Carving by the first few views, by strict intersection: a voxel stays if all silhouettes hold it.
+# Carving by the first few views, by strict intersection: a voxel stays if all silhouettes hold it. Said in distances to
+# the outlines: if the least of them is above 0; from a field of distances comes a smooth surface.
 
+outlines = torch.stack([signed_distance(mask) for mask in masks])
 numbers = (1, 2, 3, 4, 6, 8, 12, 24)
 hulls = {}
 print("views  IoU with the cup  IoU with the cup filled  hollow filled")
 for number in numbers:
     first = cameras.CameraTensors(*(field[:number] for field in views))
-    hull = hulls[number] = visual_hull(masks[:number], first, grid, rule="all")
+    hull = hulls[number] = visual_hull(outlines[:number], first, grid, rule="all", threshold=0.0)
     scores = [float(metrics.voxel_iou(hull.occupancy, truth)) for truth in (solid, filled)]
     inside = float(hull.occupancy[filled & ~solid].float().mean())
     print(f"{number:5}  {scores[0]:16.3f}  {scores[1]:23.3f}  {100 * inside:11.1f} %")
@@ -58,7 +60,7 @@ axes[0, 0].set_title("the cup")
 axes[1, 0].imshow(masks[7], cmap="gray_r")
 axes[1, 0].set_title("one of its silhouettes")
 for column, number in enumerate((2, 4, 24), 1):
-    surface = extract_mesh(hulls[number].support, grid)  # a smoother surface than that of the voxels themselves
+    surface = extract_mesh(hulls[number].support, grid, level=0.0)
     colours = np.full((len(surface.faces), 3), clay.colour, np.float32)
     shown = data.render_mesh(data.Mesh(surface.vertices.astype(np.float64), surface.faces, colours), eye, lights)
     axes[0, column].imshow(shown.images[0].permute(1, 2, 0))

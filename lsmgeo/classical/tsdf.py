@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from lsmgeo import functional
-from lsmgeo._checks import check_geometry, check_mask, check_number, describe
+from lsmgeo._checks import check_geometry, check_mask, check_number, check_whole, describe
 from lsmgeo._sites import Cameras
 from lsmgeo.cameras import CameraTensors, as_tensors, resize, stack
 from lsmgeo.cameras.tensors import select
@@ -53,8 +53,8 @@ def fuse_depth(
     little. (Curless and Levoy, "A volumetric method for building complex models from range images", SIGGRAPH 1996,
     sections 3 and 5.)
 
-    Between pixels inverse depth is interpolated, which is exact on planes; next to a jump larger than the truncation,
-    and next to pixels without depth, the nearest pixel's is taken.
+    Between pixels inverse depth is interpolated, which is exact on planes; next to a bend by more than the truncation,
+    as at a jump, and next to pixels without depth, the nearest pixel's is taken.
 
     Convention:
         Depth is camera z, 0 where there is none: such pixels say nothing, unless they are `background`. Integer pixel
@@ -98,6 +98,7 @@ def fuse_depth(
     truncation = TRUNCATION * voxel_side(grid) if truncation is None else truncation
     if not check_number(who, "truncation", truncation, "a positive number") > 0:
         raise OptionError(f"{who}: truncation must be a positive number; got {truncation!r}")
+    check_whole(who, "memory", memory, 1)
     columns = [
         _each(who, name, value, views)
         for name, value in (
@@ -208,10 +209,7 @@ def _feature_maps(maps: _Maps, camera: CameraTensors, truncation: float) -> tupl
     depth = maps.depth
     has_depth = depth > 0
     inverse = torch.where(has_depth, 1 / torch.where(has_depth, depth, 1), 0)
-    # Pixels whose neighbourhood, in which all samples near them are interpolated, has a jump or a hole.
-    around = pad(depth[None, None], (1, 1, 1, 1), mode="replicate")
-    largest, smallest = max_pool2d(around, 3, 1), -max_pool2d(-around, 3, 1)
-    rough = ((largest - smallest > truncation) | (smallest <= 0))[0, 0]
+    rough = _is_rough(inverse, truncation)
     weight = _cosine(inverse, camera)
     if maps.background is not None:
         # The largest of the negative is the least: a rim of one pixel is no background.
@@ -223,6 +221,18 @@ def _feature_maps(maps: _Maps, camera: CameraTensors, truncation: float) -> tupl
     smooth = torch.stack((inverse, rough.to(depth.dtype)))
     nearest = torch.stack((inverse, weight))
     return smooth[None, None], nearest[None, None]
+
+
+def _is_rough(inverse: Tensor, truncation: float) -> Tensor:
+    """Whether depth bends by more than the truncation at a pixel, or a neighbour has none, (h, w) bool.
+
+    Second differences of inverse depth are 0 on every plane, however steep, and large on both sides of a jump.
+    """
+    rough = -max_pool2d(-inverse[None, None], 3, 1, 1)[0, 0] <= 0
+    for axis in (0, 1):
+        bend = pad(inverse.diff(2, axis), (1, 1, 0, 0) if axis else (0, 0, 1, 1))[: len(inverse), : inverse.shape[1]]
+        rough |= bend.abs() > truncation * inverse.square()
+    return rough
 
 
 def _cosine(inverse: Tensor, camera: CameraTensors) -> Tensor:

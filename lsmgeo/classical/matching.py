@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
@@ -13,14 +14,13 @@ from lsmgeo import functional
 from lsmgeo._checks import check_choice, check_float, check_number, check_size, check_whole
 from lsmgeo.cameras import CameraTensors, select
 from lsmgeo.cameras.tensors import Cameras, as_tensors
+from lsmgeo.classical.correlation import UNRELATED, Correlation, on_threads
 from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.grids import FrustumGrid
 
 __all__ = ["SCORES", "UNRELATED", "MatchingCosts", "aggregate_views", "matching_costs", "matching_costs_slabs"]
 
 SCORES = ("zncc", "sad", "census", "cosine")
-# What unrelated patches cost on average, and places that nobody sees.
-UNRELATED = 1.0
 LUMINANCE = (0.299, 0.587, 0.114)
 
 
@@ -131,6 +131,35 @@ def matching_costs_slabs(
         >>> [(start, tuple(costs.shape)) for start, (costs, visible) in slabs]
         [(0, (1, 2, 6, 8)), (2, (1, 2, 6, 8)), (4, (1, 1, 6, 8))]
     """
+    warped = warp_neighbours(
+        images, cameras, depths, planes_per_slab, size=size, score=score, window=window, noise=noise
+    )
+    if warped.correlation is not None:
+        return _fast_costs(warped.slabs, warped.correlation)
+    compare = _comparison(score, warped.reference, window, noise)
+    return ((start, MatchingCosts(compare(volume), visible)) for start, volume, visible in warped.slabs)
+
+
+class Warped(NamedTuple):
+    """The neighbours warped onto the planes of the reference's frustum, slab by slab."""
+
+    reference: Tensor  # (C, h, w)
+    slabs: Iterator[tuple[int, Tensor, Tensor]]  # first plane, (V-1, C, d, h, w), visible (V-1, d, h, w)
+    correlation: Correlation | None  # where costs can be had without tensor operations
+
+
+def warp_neighbours(
+    images: Tensor,
+    cameras: Cameras,
+    depths: Tensor,
+    planes_per_slab: int,
+    *,
+    size: tuple[int, int] | None,
+    score: str,
+    window: int,
+    noise: float,
+) -> Warped:
+    """Check the arguments of `matching_costs_slabs` and begin."""
     who = "matching_costs"
     check_choice(who, "score", score, SCORES)
     window = check_whole(who, "window", window, 1)
@@ -149,27 +178,43 @@ def matching_costs_slabs(
             f"{who}: cameras must have the images' leading shape (V,) = ({len(images)},); "
             f"got {tuple(tensors.cam_from_world.shape[:-2])}"
         )
-    frame = (images.shape[2], images.shape[3]) if size is None else check_size(who, "size", size, 2, "(h, w)")
+    height, width = images.shape[2:] if size is None else check_size(who, "size", size, 2, "(h, w)")
     if score in ("zncc", "census"):
         images = luminance(images)
+    if score == "zncc":
+        # Correlation ignores an offset; without it squares lose less to rounding.
+        images = images - images[0].detach().mean()
     first = select(tensors, 0, 0)
     alone, others = (
         CameraTensors(*(torch.as_tensor(field)[part] for field in tensors)) for part in (slice(0, 1), slice(1, None))
     )
-    grid = FrustumGrid(first, depths, (frame[0], frame[1]))
     reference = images[0]
-    if tuple(reference.shape[1:]) != tuple(frame):
+    if tuple(reference.shape[1:]) != (height, width):
         # The reference's own frustum meets its image at the same pixels on every plane.
-        plane = FrustumGrid(first, depths[:1].detach(), (frame[0], frame[1]))
+        plane = FrustumGrid(first, depths[:1].detach(), (height, width))
         reference = functional.unproject(images[None, :1], alone, plane, padding_mode="border").volume[0, 0, :, 0]
-    compare = _comparison(score, reference, window, noise)
-    warped = functional.unproject_slabs(images[None, 1:], others, grid, planes_per_slab, padding_mode="border")
+    grid = FrustumGrid(first, depths, (height, width))
+    slabs = functional.unproject_slabs(images[None, 1:], others, grid, planes_per_slab, padding_mode="border")
+    correlation = None
+    is_plain = images.device.type == "cpu" and images.dtype == torch.float32 and not torch.is_grad_enabled()
+    if score == "zncc" and is_plain:
+        correlation = Correlation(reference[0], window, noise)
+    return Warped(reference, ((start, volume[0], visible[0]) for start, volume, visible in slabs), correlation)
 
-    def slabs() -> Iterator[tuple[int, MatchingCosts]]:
-        for start, volume, visible in warped:
-            yield start, MatchingCosts(compare(volume[0]), visible[0])
 
-    return slabs()
+def _fast_costs(
+    slabs: Iterator[tuple[int, Tensor, Tensor]], correlation: Correlation
+) -> Iterator[tuple[int, MatchingCosts]]:
+    for start, volume, visible in slabs:
+        warped = volume[:, 0].flatten(0, 1).contiguous().numpy()
+        costs = torch.empty(visible.shape)
+        out = costs.flatten(0, 1).numpy()
+
+        def compare(number: int, warped: np.ndarray = warped, out: np.ndarray = out) -> None:
+            correlation.compare(warped[number], out[number])
+
+        on_threads(compare, range(len(out)))
+        yield start, MatchingCosts(costs, visible)
 
 
 def luminance(images: Tensor) -> Tensor:
@@ -188,13 +233,11 @@ def luminance(images: Tensor) -> Tensor:
 def _comparison(score: str, reference: Tensor, window: int, noise: float) -> Callable[[Tensor], Tensor]:
     """The costs (N, d, h, w) of warped neighbours (N, C, d, h, w) against a reference (C, h, w)."""
     if score == "zncc":
-        # Correlation ignores an offset; without it squares lose less to rounding.
-        shift = reference.detach().mean()
-        grey = reference[0] - shift
+        grey = reference[0]
         mean, spread = window_means(grey, window), _variance(grey, window) + noise**2
 
         def zncc(warped: Tensor) -> Tensor:
-            other = warped[:, 0] - shift
+            other = warped[:, 0]
             covariance = window_means(other * grey, window) - window_means(other, window) * mean
             return 1 - covariance * (spread * (_variance(other, window) + noise**2)).rsqrt()
 
@@ -275,13 +318,52 @@ def aggregate_views(
         >>> cost.item(), count.item()
         (0.20000000298023224, 3)
     """
-    who = "aggregate_views"
     number = costs.shape[0]
-    best = check_whole(who, "best", (number + 1) // 2 if best is None else best, 1, number)
-    min_views = check_whole(who, "min_views", min_views, 1, number)
+    best, min_views = _numbers(number, best, min_views)
     count = visible.sum(0)
     if number == 1:
         return torch.where(visible[0], costs[0], UNRELATED), count
     lowest = torch.where(visible, costs, torch.inf).sort(0).values[:best]
     total = torch.where(lowest.isfinite(), lowest, 0.0).sum(0)
     return torch.where(count >= min_views, total / count.clamp(1, best), UNRELATED), count
+
+
+def aggregated_costs(
+    images: Tensor,
+    cameras: Cameras,
+    depths: Tensor,
+    planes_per_slab: int,
+    *,
+    best: int | None,
+    min_views: int,
+    score: str,
+    window: int,
+    noise: float,
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """`aggregate_views` of `matching_costs_slabs`: costs (d, h, w) in float32, and whether enough see a site."""
+    warped = warp_neighbours(
+        images, cameras, depths, planes_per_slab, size=None, score=score, window=window, noise=noise
+    )
+    best, min_views = _numbers(len(images) - 1, best, min_views)
+    if warped.correlation is None:
+        compare = _comparison(score, warped.reference, window, noise)
+        for _, volume, visible in warped.slabs:
+            cost, count = aggregate_views(compare(volume), visible, best=best, min_views=min_views)
+            yield cost.float(), count >= min_views
+        return
+    correlate = warped.correlation.aggregate
+    for _, volume, visible in warped.slabs:
+        cost, seen = torch.empty(visible.shape[1:]), torch.empty(visible.shape[1:], dtype=torch.bool)
+        arrays = (volume[:, 0].numpy(), visible.numpy(), cost.numpy(), seen.numpy())
+
+        def aggregate(plane: int, arrays: tuple[np.ndarray, ...] = arrays) -> None:
+            values, sees, costs, seens = arrays
+            correlate(values[:, plane], sees[:, plane], best, min_views, costs[plane], seens[plane])
+
+        on_threads(aggregate, range(len(cost)))
+        yield cost, seen
+
+
+def _numbers(neighbours: int, best: int | None, min_views: int) -> tuple[int, int]:
+    best = check_whole("aggregate_views", "best", (neighbours + 1) // 2 if best is None else best, 1, neighbours)
+    return best, check_whole("aggregate_views", "min_views", min_views, 1, neighbours)

@@ -12,13 +12,19 @@ from torch.nn.functional import pad, unfold
 from tqdm import tqdm
 
 from lsmgeo._checks import check_float, check_whole
+from lsmgeo.cameras import resize
 from lsmgeo.cameras.tensors import Cameras
-from lsmgeo.classical.matching import UNRELATED, aggregate_views, matching_costs_slabs
+from lsmgeo.classical.matching import UNRELATED, aggregated_costs
+from lsmgeo.classical.planes import longest_path
 from lsmgeo.classical.winners import Winners
 from lsmgeo.errors import OptionError
 
 __all__ = ["DepthMap", "kept", "slab_planes", "sweep"]
 
+# Minima nearer to each other are one place: a cost varies no faster than the image.
+SAME_PIXELS = 2.0
+# More planes at once are not faster.
+MOST_PLANES = 8
 # How many arrays of each kind are alive at once at the worst moment, and what the libraries take besides.
 LIVE_COSTS = 8
 LIVE_IMAGES = 40
@@ -55,7 +61,7 @@ def slab_planes(neighbours: int, channels: int, size: tuple[int, int], memory: i
             f"memory must be at least {need} MiB for {neighbours + 1} views of {size[1]} x {size[0]}; "
             f"got {memory >> 20} MiB"
         )
-    return int((memory - fixed) // plane)
+    return int(min((memory - fixed) // plane, MOST_PLANES))
 
 
 def sweep(
@@ -112,22 +118,34 @@ def sweep(
     min_views = check_whole("sweep", "min_views", min_views, 1, neighbours)
     slab = slab_planes(neighbours, channels if score in ("sad", "cosine") else 1, (height, width), memory)
     with torch.no_grad():
-        winners = Winners(depths, (height, width), UNRELATED)
-        slabs = matching_costs_slabs(images, cameras, depths, slab, score=score, window=window, noise=noise)
+        winners = Winners(depths, (height, width), UNRELATED, _planes_apart(cameras, depths, (height, width)))
         with tqdm(total=len(depths), desc="sweep", unit="plane", disable=None if progress else True) as bar:
-            for _, (costs, visible) in slabs:
-                cost, count = aggregate_views(costs, visible, best=best, min_views=min_views)
-                del costs, visible
-                cost = cost.float()
+            for cost, seen in aggregated_costs(
+                images,
+                cameras,
+                depths,
+                slab,
+                best=best,
+                min_views=min_views,
+                score=score,
+                window=window,
+                noise=noise,
+            ):
                 if cost_filter is not None:
                     cost = cost_filter(cost)
-                for plane_cost, plane_count in zip(cost, count, strict=True):
-                    winners.push(plane_cost, plane_count >= min_views)
+                for plane, is_seen in zip(cost, seen, strict=True):
+                    winners.push(plane, is_seen)
                 bar.update(len(cost))
         correlation = (1 - winners.best).clamp(0, 1)
         confidence = correlation * winners.uniqueness().sqrt() * _agreement(winners.place)
         confidence = torch.where(winners.place >= 0, confidence, 0.0)
         return DepthMap(winners.depth(), confidence, winners.best.clamp_max(UNRELATED), winners.place)
+
+
+def _planes_apart(cameras: Cameras, depths: Tensor, size: tuple[int, int]) -> float:
+    """Planes in which a sample moves `SAME_PIXELS` on the average, in the neighbour where it moves most."""
+    path = longest_path(resize(cameras, *size), float(depths[0]), float(depths[-1]))
+    return SAME_PIXELS * (len(depths) - 1) / max(path, 1e-6)
 
 
 def kept(depth_map: DepthMap, density: float, least: float = 0.0, specks: int = 0) -> Tensor:

@@ -21,9 +21,11 @@ class Winners:
         depths: (P,) the planes' depths, ascending.
         size: (h, w).
         unrelated: the cost of what nobody sees.
+        apart: planes within which minima are one place.
     """
 
-    def __init__(self, depths: Tensor, size: tuple[int, int], unrelated: float):
+    def __init__(self, depths: Tensor, size: tuple[int, int], unrelated: float, apart: float = SAME_PLANES):
+        self.apart = max(apart, SAME_PLANES)
         self.inverse = (1 / depths.double()).tolist()
         self.unrelated = unrelated
         self.before: list[tuple[Tensor, Tensor]] = []
@@ -40,27 +42,34 @@ class Winners:
             return
         (previous, had_seen), (middle, usable), (following, will_see) = self.before
         self.before.pop(0)
-        index = self.count - 2
-        is_minimum = usable & (middle <= previous) & (middle < following)
-        # Slopes per inverse depth on both sides; the parabola's vertex is where its derivative is 0.
-        step, next_step = (self.inverse[index + i] - self.inverse[index + i + 1] for i in (-1, 0))
-        slope, next_slope = (middle - previous) / step, (following - middle) / next_step
-        vertex = -0.5 * (slope * next_step + next_slope * step) / (next_slope - slope).clamp_min(1e-30)
-        offset = torch.where(vertex > 0, vertex / next_step, vertex / step)
-        # Beside what nobody sees there is no curve to follow.
-        place = index + torch.where(had_seen & will_see, offset, 0.0)
-        elsewhere = (place - self.place > SAME_PLANES) | (self.place < 0)
-        better = is_minimum & (middle < self.best)
-        loser = torch.where(better, self.best, torch.where(is_minimum, middle, self.unrelated))
-        loser = loser.clamp_max(self.unrelated)
-        # A better minimum beside the old one replaces it; elsewhere it demotes the old one.
-        self.second = torch.where(
-            better,
-            torch.where(elsewhere, loser, self.second),
-            torch.where(elsewhere, torch.minimum(loser, self.second), self.second),
+        # Few pixels have a minimum here that counts; all else is done for these alone.
+        counts = usable & (middle <= previous) & (middle < following) & (middle < torch.maximum(self.best, self.second))
+        at = counts.flatten().nonzero()[:, 0]
+        if len(at) == 0:
+            return
+        before, cost, after, best, second, winner = (
+            values.flatten()[at] for values in (previous, middle, following, self.best, self.second, self.place)
         )
-        self.best = torch.where(better, middle, self.best)
-        self.place = torch.where(better, place, self.place)
+        # Beside what nobody sees there is no curve to follow.
+        has_sides = (had_seen & will_see).flatten()[at]
+        place = self.count - 2 + torch.where(has_sides, self._offset(before, cost, after), 0.0)
+        elsewhere = (place - winner > self.apart) | (winner < 0)
+        better = cost < best
+        # A better minimum beside the old one replaces it; elsewhere it demotes the old one.
+        loser = torch.where(better, best, cost).clamp_max(self.unrelated)
+        demoted = torch.where(better, loser, torch.minimum(loser, second))
+        self.second.view(-1)[at] = torch.where(elsewhere, demoted, second)
+        self.best.view(-1)[at] = torch.where(better, cost, best)
+        self.place.view(-1)[at] = torch.where(better, place, winner)
+
+    def _offset(self, before: Tensor, cost: Tensor, after: Tensor) -> Tensor:
+        """Where the parabola through three planes has its vertex, in planes from the middle one, in [-0.5, 0.5]."""
+        first, middle, last = self.inverse[self.count - 3 : self.count]
+        step, next_step = first - middle, middle - last
+        # Its derivative by inverse depth is, half way between two planes, their slope; it is 0 at the vertex.
+        slope, next_slope = (cost - before) / step, (after - cost) / next_step
+        vertex = -0.5 * (slope * next_step + next_slope * step) / (next_slope - slope).clamp_min(1e-30)
+        return torch.where(vertex > 0, vertex / next_step, vertex / step)
 
     def depth(self) -> Tensor:
         """Depth of the winners (h, w) float32, linear in inverse depth between planes; 0 where there is none."""

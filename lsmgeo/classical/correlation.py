@@ -1,0 +1,149 @@
+"""Correlation costs plane by plane, by OpenCV's box filter in memory that is used again: fast, without derivatives.
+
+It does what `lsmgeo.classical.matching` does with tensor operations; those make a fresh array at every step, and
+fresh memory costs as much as the arithmetic.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+__all__ = ["UNRELATED", "Correlation", "on_threads"]
+
+Floats = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+# What unrelated patches cost on average, and places that nobody sees.
+UNRELATED = 1.0
+
+
+def on_threads(task: Callable[[int], None], numbers: Iterable[int]) -> None:
+    """Do a task for every number on as many threads as PyTorch uses; NumPy and OpenCV let go of Python's lock."""
+    threads = torch.get_num_threads()
+    if threads == 1:
+        for number in numbers:
+            task(number)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in pool.map(task, numbers):
+            pass
+
+
+class Correlation:
+    """``1 - cov(r, s) / sqrt((var r + noise^2) (var s + noise^2))`` over windows, for one reference r and many s.
+
+    Args:
+        reference: (h, w) float32 grey values, best with a mean of about 0.
+        window: side of the windows in pixels, odd.
+        noise: see `lsmgeo.classical.matching_costs`.
+    """
+
+    def __init__(self, reference: Tensor, window: int, noise: float):
+        self.reference: Floats = np.ascontiguousarray(reference.numpy())
+        self.window, self.noise = window, noise
+        self.rooms = threading.local()
+        height, width = self.reference.shape
+        # OpenCV counts the pixels beyond the border as zeros.
+        self.edges = [_edges(height, window), _edges(width, window)]
+        self.mean, energy = np.empty_like(self.reference), np.empty_like(self.reference)
+        self._average(self.reference, self.mean)
+        self._average(self.reference**2, energy)
+        spread = np.maximum(energy - self.mean**2, 0) + np.float32(noise**2)
+        self.scale: Floats = -1 / np.sqrt(spread)
+
+    def _room(self, arrays: int) -> Floats:
+        """(arrays, h, w) of the calling thread, with any values."""
+        room = getattr(self.rooms, "room", None)
+        if room is None or len(room) < arrays:
+            room = self.rooms.room = np.empty((arrays, *self.reference.shape), np.float32)
+        return room[:arrays]
+
+    def _average(self, values: Floats, out: Floats) -> None:
+        import cv2
+
+        cv2.boxFilter(values, -1, (self.window, self.window), dst=out, borderType=cv2.BORDER_CONSTANT)
+        (rows, columns) = self.edges
+        for part, factors in rows:
+            out[part] *= factors[:, None]
+        for part, factors in columns:
+            out[:, part] *= factors
+
+    def compare(self, warped: Floats, out: Floats, room: Floats | None = None) -> None:
+        """Write the costs (h, w) of one warped image (h, w)."""
+        mean, energy, product = self._room(3) if room is None else room[:3]
+        self._average(warped, mean)
+        np.multiply(warped, warped, out=product)
+        self._average(product, energy)
+        np.multiply(mean, mean, out=product)
+        np.subtract(energy, product, out=energy)
+        np.maximum(energy, 0, out=energy)
+        np.add(energy, np.float32(self.noise**2), out=energy)
+        np.sqrt(energy, out=energy)
+        np.multiply(warped, self.reference, out=out)
+        self._average(out, product)
+        np.multiply(mean, self.mean, out=mean)
+        np.subtract(product, mean, out=product)
+        np.multiply(product, self.scale, out=product)
+        np.divide(product, energy, out=product)
+        np.add(product, 1, out=out)
+
+    def aggregate(self, warped: Floats, visible: Mask, best: int, min_views: int, out: Floats, seen: Mask) -> None:
+        """Write the mean cost (h, w) of the best neighbours, and where enough see a site, for one plane.
+
+        Args:
+            warped: (N, h, w) of all neighbours.
+            visible: (N, h, w).
+            best: see `lsmgeo.classical.aggregate_views`.
+            min_views: likewise.
+            out: (h, w), written.
+            seen: (h, w), written.
+        """
+        number = len(warped)
+        room = self._room(number + 4)
+        costs, spare = list(room[4:]), room[3]
+        for neighbour in range(number):
+            self.compare(warped[neighbour], costs[neighbour], room)
+        all_see = bool(visible.all())
+        if not all_see:
+            for cost, sees in zip(costs, visible, strict=True):
+                np.copyto(cost, np.inf, where=~sees)
+        # The lowest `best` bubble to the front, one after another.
+        for first in range(best):
+            for place in range(number - 1, first, -1):
+                np.minimum(costs[place - 1], costs[place], out=spare)
+                if first < best - 1:
+                    np.maximum(costs[place - 1], costs[place], out=costs[place])
+                costs[place - 1], spare = spare, costs[place - 1]
+        if all_see:
+            seen[:] = True
+            total = costs[0]
+            for cost in costs[1:best]:
+                np.add(total, cost, out=total)
+            np.multiply(total, np.float32(1 / best), out=out)
+            return
+        count = np.add.reduce(visible.view(np.uint8), axis=0, dtype=np.uint8 if number < 256 else np.int32)
+        np.greater_equal(count, min_views, out=seen)
+        for place, cost in enumerate(costs[:best]):
+            np.copyto(cost, 0, where=count <= place)
+        total = costs[0]
+        for cost in costs[1:best]:
+            np.add(total, cost, out=total)
+        np.divide(total, np.clip(count, 1, best).astype(np.float32), out=out)
+        np.copyto(out, np.float32(UNRELATED), where=~seen)
+
+
+def _edges(length: int, window: int) -> list[tuple[slice, Floats]]:
+    """The places near both ends of a line where windows are cut, and by what means over them grow."""
+    radius = window // 2
+    places = np.arange(length)
+    count = np.minimum(places + radius, length - 1) - np.maximum(places - radius, 0) + 1
+    factors = (window / count).astype(np.float32)
+    parts = (slice(0, min(radius, length)), slice(max(radius, length - radius), length))
+    return [(part, factors[part]) for part in parts if len(factors[part])]

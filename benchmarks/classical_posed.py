@@ -15,8 +15,8 @@ from lsmgeo.classical import Reconstruction, reconstruct_scene
 
 SETS = {"fountain": "strecha_fountain_quarter", "temple": "middlebury_temple", "COLMAP scene": "colmap_scene"}
 DENSITY, MOST_ERROR = 0.4, 0.005
-# Every third view is judged, all are swept: agreement is asked of all.
-STEP = 3
+# So many views next to each other are swept, and agreement is asked of these alone.
+VIEWS = 6
 
 
 def triangulated_of(scene: data.PosedImages, views: list[int]) -> list[Depths]:
@@ -58,11 +58,11 @@ def measure(root: Path, size: int = 640, names: tuple[str, ...] = tuple(SETS)) -
     figures: dict[str, Any] = {}
     for name in names:
         scene = data.open(root / SETS[name])
-        result = reconstruct_scene(scene, size=size, mesh=False, density=1.0, progress=True)
-        judged = [one for one in result.views if one.view % STEP == 0]
-        truths = {"triangulated features": triangulated_of(scene, [one.view for one in judged])}
+        views = list(range(min(VIEWS, len(scene))))
+        judged = reconstruct_scene(scene, views, size=size, mesh=False, density=1.0, progress=True).views
+        truths = {"triangulated features": triangulated_of(scene, views)}
         if scene.points is not None:
-            truths["the set's sparse points"] = [sparse_of(scene, one.view) for one in judged]  # type: ignore[misc]
+            truths["the set's sparse points"] = [sparse_of(scene, view) for view in views]  # type: ignore[misc]
         for kind, depths in truths.items():
             errors = [
                 errors_at(one, truth, scene.size(one.view), DENSITY) for one, truth in zip(judged, depths, strict=True)
@@ -73,7 +73,7 @@ def measure(root: Path, size: int = 640, names: tuple[str, ...] = tuple(SETS)) -
                 Row(
                     name,
                     f"median depth error at {100 * DENSITY:.0f} % density against {len(pooled)} {kind} in "
-                    f"{len(judged)} views",
+                    f"{len(views)} views",
                     f"{100 * median:.2f} %, 90 % below {100 * float(np.quantile(pooled, 0.9)):.1f} %",
                     f"at most {100 * MOST_ERROR} %",
                     median <= MOST_ERROR,

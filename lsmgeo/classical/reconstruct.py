@@ -18,7 +18,7 @@ from lsmgeo.classical.consistency import consistent_views
 from lsmgeo.classical.filtering import guided_filter
 from lsmgeo.classical.plane_sweep import DepthMap, kept, sweep
 from lsmgeo.classical.planes import MOST_PLANES, sweep_planes
-from lsmgeo.classical.views import default_depth_range, select_neighbours
+from lsmgeo.classical.views import camera_centers, default_depth_range, select_neighbours
 from lsmgeo.data import PosedImages
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid
@@ -42,6 +42,8 @@ SPECK_FRACTION = 5e-4
 # Standard deviation of luminance that counts as no texture.
 NOISE = 0.5 / 255
 SPECK_FACES = 100
+# With so many other depth maps, the nearest views', a depth map is compared at most.
+MOST_CHECKED = 12
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,8 @@ class Reconstruction:
         depths: (P,) planes, ascending, world units.
         image: (3, h, w) the reference at the depth map's size.
         camera: its camera at that size.
-        depth_map: depth and confidence of every pixel.
+        depth_map: depth and confidence of every pixel; where other views were asked, any pixel that more of them
+            agree with, up to two, is trusted before all with fewer.
         mask: (h, w) bool, the pixels kept.
         points: (N, 3) float32 world positions of the kept pixels.
         colours: (N, 3) uint8.
@@ -310,11 +313,15 @@ class _Sweeper:
             colours=np.empty((0, 3), np.uint8),
             error=None,
         )
-        return self._keep(one, torch.ones(shape, dtype=torch.bool))
+        return self._keep(one, depth_map.confidence > LEAST_CONFIDENCE)
 
-    def supported(self, one: Reconstruction, others: list[Reconstruction], least: int) -> Reconstruction:
-        """A reconstruction with what other views say of it."""
-        others = [other for other in others if other.view != one.view]
+    def supported(self, one: Reconstruction, swept: Sequence[Reconstruction], least: int) -> Reconstruction:
+        """A reconstruction with what the others say of it."""
+        centers = camera_centers(self.scene.cameras)
+        others = sorted(
+            (other for other in swept if other.view != one.view),
+            key=lambda other: float(np.linalg.norm(centers[other.view] - centers[one.view])),
+        )[:MOST_CHECKED]
         if not others:
             return one
         support = consistent_views(
@@ -323,17 +330,18 @@ class _Sweeper:
             [other.depth_map.depth for other in others],
             [other.camera for other in others],
         )
-        trusted = (1 + support.clamp_max(3)) / 4
-        depth_map = one.depth_map._replace(confidence=one.depth_map.confidence * trusted)
-        return self._keep(replace(one, depth_map=depth_map, support=support), support >= least)
+        # Any pixel with more support comes before all with less; beyond two, more says nothing.
+        most = min(len(others), 2)
+        confidence = (support.clamp_max(most) + one.depth_map.confidence) / (most + 1)
+        depth_map = one.depth_map._replace(confidence=torch.where(one.depth_map.depth > 0, confidence, 0.0))
+        allowed = (support >= least) & (one.depth_map.confidence > LEAST_CONFIDENCE)
+        return self._keep(replace(one, depth_map=depth_map, support=support), allowed)
 
     def _keep(self, one: Reconstruction, allowed: Tensor) -> Reconstruction:
         """A reconstruction with the best of the allowed pixels."""
         depth_map = one.depth_map
         specks = round(SPECK_FRACTION * depth_map.depth.numel())
-        mask = kept(
-            depth_map._replace(depth=torch.where(allowed, depth_map.depth, 0.0)), self.density, LEAST_CONFIDENCE, specks
-        )
+        mask = kept(depth_map._replace(depth=torch.where(allowed, depth_map.depth, 0.0)), self.density, specks=specks)
         points = points_of(depth_map.depth, one.camera)[mask].float().numpy()
         colours = (one.image.permute(1, 2, 0)[mask] * 255).round().to(torch.uint8).numpy()
         error = sparse_error(self.scene, one.view, depth_map, kept(depth_map, self.density))

@@ -66,7 +66,7 @@ def extract_mesh(
     Raises:
         ShapeError, DTypeError: a field that does not fit the grid.
         GridError: a grid with one pose a scene.
-        OptionError: a level that is no number, negative specks.
+        OptionError: a field that is not finite, a level that is no number, negative specks.
 
     Example:
         >>> from lsmgeo import VoxelGrid, scenes
@@ -91,6 +91,8 @@ def extract_mesh(
     if tuple(values.shape) != grid.shape:
         raise ShapeError(f"{who}: field must be {grid.shape}, as the grid; got {tuple(values.shape)}")
     values = values.detach().cpu()
+    if not bool(values.isfinite().all()):
+        raise OptionError(f"{who}: field must be finite; got a NaN or an infinity")
     if isinstance(field, Tsdf):
         surface = 0.0 if level is None else level
         # Larger inside, like every other field.

@@ -86,97 +86,122 @@ def info(path: str, out: str = "lsmgeo-info") -> int:
 
 def reconstruct(
     scene: str,
-    method: Literal["sweep"] = "sweep",
-    view: int | str = 0,
+    method: Literal["sweep", "hull"] = "sweep",
+    view: int | str | None = None,
     out: str = "lsmgeo-reconstruct",
     neighbours: int = 4,
-    size: int = 400,
+    size: int = 640,
     planes: int = 300,
+    spacing: Literal["inverse", "depth", "disparity"] = "inverse",
     near: float | None = None,
     far: float | None = None,
-    density: float = 0.4,
-    depth_format: Literal["npy", "png"] = "npy",
+    score: Literal["zncc", "sad", "census"] = "zncc",
+    window: int = 5,
+    density: float | None = None,
+    resolution: int = 192,
+    rule: Literal["all", "mean"] = "all",
+    masks: str | None = None,
+    background: str | None = None,
     memory: int = 1024,
-) -> None:
-    """Reconstruct what one of a scene's posed photographs sees: depth, coloured points, and a summary picture.
+) -> int:
+    """Reconstruct posed photographs: depth maps, coloured points, a mesh, and a page to turn it around in.
 
     Args:
         scene: posed photographs in any form that lsmgeo reads.
-        method: "sweep" is plane-sweep stereo.
-        view: the reference photograph, its number (by name, from 0) or its name.
+        method: "sweep" is plane-sweep stereo, "hull" the visual hull of silhouettes.
+        view: a photograph, its number (by name, from 0) or its name: sweep this one alone; a hull is looked at from
+            there. By default all are swept, checked against each other and fused.
         out: folder for the results; created where it does not exist.
-        neighbours: number of other photographs to match with.
-        size: longer side of the depth map in pixels.
-        planes: number of depth planes.
-        near: nearest depth in world units; by default told from the scene.
-        far: farthest depth.
-        density: largest fraction of the pixels to keep.
-        depth_format: "npy" (float32, world units) or "png" (16 bit, scaled; the scale is printed).
-        memory: MiB that the sweep may take.
+        neighbours: for sweeps, number of other photographs to match with.
+        size: longer side in pixels at which photographs are used.
+        planes: for sweeps, number of depth planes.
+        spacing: for sweeps, what is even between planes; with "disparity" a step is a pixel, and their number follows.
+        near: for sweeps, nearest depth in world units; by default told from the scene.
+        far: for sweeps, farthest depth.
+        score: for sweeps, how patches are compared.
+        window: for sweeps, side of the patches in pixels.
+        density: for sweeps, largest fraction of the pixels to keep; by default 0.4 of one view, 0.8 of all.
+        resolution: voxels along the longest side of the box in which the mesh is made.
+        rule: for hulls, whether a voxel must lie in "all" silhouettes, or in three quarters of them ("mean"), which
+            forgives wrong ones.
+        masks: for hulls, a folder of silhouettes; by default alpha, or a folder masks or silhouettes beside the
+            photographs.
+        background: for hulls, the colour behind the object where nothing else tells its silhouettes: white, black, or
+            three numbers such as 0.1,0.8,0.2.
+        memory: for sweeps, MiB that one may take.
+
+    Returns:
+        The exit status: 0, or 1 where nothing could be told.
     """
-    import io
     import time
     from pathlib import Path
 
-    import numpy as np
-    import torch
-
     from lsmgeo import data
-    from lsmgeo.classical import pictures, reconstruct_view
+    from lsmgeo.classical.methods import hull_results, readable, sweep_results
+    from lsmgeo.classical.outputs import write_results
     from lsmgeo.errors import OptionError
 
+    for option, value, of in (
+        ("masks", masks, "hull"),
+        ("background", background, "hull"),
+        ("near", near, "sweep"),
+        ("far", far, "sweep"),
+        ("density", density, "sweep"),
+    ):
+        if value is not None and method != of:
+            raise OptionError(f"{option} is for method {of}; got method {method}")
     start = time.perf_counter()
     images = data.open(scene)
-    if isinstance(view, str):
-        if view not in images.names:
-            raise OptionError(f"view must be 0..{len(images) - 1} or a photograph's name; got {view!r}")
-        view = images.names.index(view)
-    result = reconstruct_view(
-        images,
-        view,
-        neighbours=neighbours,
-        size=size,
-        planes=planes,
-        near=near,
-        far=far,
-        density=density,
-        memory=memory << 20,
-        progress=True,
-    )
-    name = images.names[view]
-    depth = torch.where(result.mask, result.depth_map.depth, 0.0)
-    # All is made before the first file is written: what fails or is interrupted until then leaves nothing behind.
-    if depth_format == "npy":
-        buffer = io.BytesIO()
-        np.save(buffer, depth.numpy())
-        files = {"depth": ("depth.npy", buffer.getvalue())}
-    else:
-        unit = float(result.depths[-1]) / 65000
-        files = {f"depth in steps of {unit:.6g}": ("depth16.png", pictures.depth_as_png16(depth, unit))}
-    files["depth in colours"] = ("depth.png", pictures.png(pictures.coloured_depth(depth, result.mask)))
-    title = f"{Path(scene).name}, view {view} ({name}), plane sweep"
-    files["summary"] = ("summary.png", pictures.summary(result, title))
-    folder = Path(out)
-    written = {what: data.write_atomic(folder / file, content) for what, (file, content) in files.items()}
-    if len(result.points):
-        written["points"] = data.write_point_cloud(folder / "points.ply", result.points, result.colours)
-
-    height, width = result.mask.shape
-    print(f"scene:       {len(images)} photographs, {images.source}")
-    print(f"view:        {view} ({name}), matched with {', '.join(images.names[other] for other in result.neighbours)}")
-    first, last = float(result.depths[0]), float(result.depths[-1])
-    print(f"sweep:       {width} x {height} pixels, {len(result.depths)} planes from {first:.4g} to {last:.4g}")
-    print(f"memory:      at most {memory} MiB beyond the libraries and the photographs")
-    print(f"kept:        {int(result.mask.sum())} pixels, {100 * float(result.mask.float().mean()):.1f} %")
-    if result.error is not None:
-        error = result.error
-        print(
-            f"depth error: median {100 * error.median:.3f} % of the depth at {error.points} of {error.observed} sparse "
-            f"points, at {100 * density:.0f} % density"
+    name = images.names[view] if isinstance(view, int) and 0 <= view < len(images) else view
+    if name is not None and name not in images.names:
+        named = "" if isinstance(view, int) else " or be a photograph's name"
+        raise OptionError(f"view must lie in 0..{len(images) - 1}{named}; got {view!r}")
+    if any(path.resolve().is_relative_to(Path(out).resolve()) for path in images.paths):
+        raise OptionError(f"out must be a folder without the photographs, which it could replace; got {out!r}")
+    images, left_out = readable(images)
+    if name is not None and name not in images.names:
+        raise OptionError(f"view must be a photograph that can be read: {left_out[0]}")
+    reference = None if name is None else images.names.index(str(name))
+    seen = "" if name is None else f", from {name}"
+    if method == "hull":
+        title = f"{Path(scene).resolve().name}, visual hull{seen}"
+        results = hull_results(
+            images,
+            reference,
+            title,
+            rule=rule,
+            masks=masks,
+            background=background,
+            resolution=resolution,
+            size=size,
         )
-    print(f"time:        {time.perf_counter() - start:.1f} s")
+    else:
+        results = sweep_results(
+            images,
+            reference,
+            f"{Path(scene).resolve().name}, plane sweep{seen}",
+            resolution=resolution,
+            density=density,
+            neighbours=neighbours,
+            size=size,
+            planes=planes,
+            spacing=spacing,
+            near=near,
+            far=far,
+            score=score,
+            window=window,
+            memory=memory << 20,
+        )
+    facts = (*results.facts, ("time", f"{time.perf_counter() - start:.1f} s"))
+    results = results._replace(facts=facts, notes=left_out + results.notes)
+    written = write_results(images, results, out)
+    for fact, value in results.facts:
+        print(f"{fact + ':':<13}{value}")
     for what, path in written.items():
-        print(f"{what + ':':<28} {path.resolve()}")
+        print(f"{what + ':':<18}{path.resolve()}")
+    for note in results.notes:
+        print(f"lsmgeo: warning: {note}", file=sys.stderr)
+    return 0 if len(results.points) else 1
 
 
 def render(

@@ -8,14 +8,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from lsmgeo.data.png import encode_png
 from lsmgeo.errors import OptionError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
 
-    from lsmgeo.classical.reconstruct import Reconstruction
+    from lsmgeo.cameras import CameraTensors
+    from lsmgeo.classical.outputs import Looked
 
-__all__ = ["coloured_depth", "depth_as_png16", "png", "summary"]
+__all__ = ["coloured_depth", "depth_as_png16", "depth_limits", "png", "summary"]
+
+# Of the summary, in inches: its width, what lies between its panels, below them and above.
+WIDTH, GAP, BELOW, ABOVE = 11.0, 0.25, 0.75, 0.75
+DPI = 100
+# Degrees by which the points are seen from aside.
+ASIDE = 25.0
+MOST_DRAWN = 150_000
 
 
 def png(image: np.ndarray) -> bytes:
@@ -36,51 +46,22 @@ def depth_as_png16(depth: torch.Tensor, unit: float) -> bytes:
     steps = (depth.double() / unit).round()
     if float(steps.max()) > 65535:
         raise OptionError(f"unit must be at least {float(depth.max()) / 65535:.3g} for these depths; got {unit:.3g}")
-    return png(steps.numpy().astype(np.uint16))
+    return encode_png(steps.numpy().astype(np.uint16))
 
 
 def coloured_depth(depth: torch.Tensor, mask: torch.Tensor) -> np.ndarray:
     """Depth as colours, near is red, far is blue, transparent outside the mask: (h, w, 4) uint8."""
     from matplotlib import colormaps
 
-    low, high = _limits(depth, mask)
+    low, high = depth_limits(depth, mask)
     scaled = 1 - ((depth - low) / max(high - low, 1e-12)).clamp(0, 1).numpy()
     colours = (colormaps["turbo"](scaled) * 255).astype(np.uint8)
     colours[..., 3] = np.where(mask.numpy(), 255, 0)
     return colours
 
 
-def summary(result: Reconstruction, title: str) -> bytes:
-    """One PNG with the reference, its depth, the confidence and the points seen from aside."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    height, width = result.mask.shape
-    figure = Figure(figsize=(13, 13 * height / width + 1.2), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title)
-    (reference, depth), (confidence, cloud) = figure.subplots(2, 2)
-    reference.imshow(result.image.permute(1, 2, 0).numpy())
-    reference.set_title("reference photograph")
-    low, high = _limits(result.depth_map.depth, result.mask)
-    shown = np.where(result.mask, result.depth_map.depth, np.nan)
-    picture = depth.imshow(shown, cmap="turbo_r", vmin=low, vmax=high)
-    depth.set_title(f"depth of the {100 * float(result.mask.float().mean()):.0f} % of the pixels kept")
-    depth.set_facecolor("0.85")
-    figure.colorbar(picture, ax=depth, label="camera z [world units]", shrink=0.8)
-    picture = confidence.imshow(result.depth_map.confidence, cmap="gray", vmin=0, vmax=1)
-    confidence.set_title("confidence")
-    figure.colorbar(picture, ax=confidence, label="0 nothing known, 1 certain", shrink=0.8)
-    _draw_cloud(cloud, result)
-    for axes in (reference, depth, confidence, cloud):
-        axes.set_xticks([])
-        axes.set_yticks([])
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=90)
-    return buffer.getvalue()
-
-
-def _limits(depth: torch.Tensor, mask: torch.Tensor) -> tuple[float, float]:
+def depth_limits(depth: torch.Tensor, mask: torch.Tensor) -> tuple[float, float]:
+    """The depths that are drawn in the deepest red and blue: of 98 % of the pixels of a mask."""
     values = depth[mask].numpy()
     if len(values) == 0:
         return 0.0, 1.0
@@ -88,21 +69,76 @@ def _limits(depth: torch.Tensor, mask: torch.Tensor) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _draw_cloud(axes: Axes, result: Reconstruction, degrees: float = 25.0) -> None:
+def summary(one: Looked, points: np.ndarray, colours: np.ndarray, title: str) -> bytes:
+    """One PNG with a view's photograph, its depth, what is certain of it, and the points seen from aside.
+
+    Args:
+        one: the view.
+        points: (N, 3) of all views.
+        colours: (N, 3) uint8.
+        title: to write above.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    # Panels have the shape of the photograph and the figure is made to measure: nothing is left empty between them.
+    rows, columns = one.depth.shape
+    wide = (WIDTH - 3 * GAP) / 2
+    high = wide * rows / columns
+    if high > wide * 1.2:
+        wide, high = wide * 1.2 * wide / high, wide * 1.2
+    width, height = 2 * wide + 3 * GAP, 2 * (high + BELOW) + ABOVE
+    figure = Figure(figsize=(width, height), dpi=DPI)
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, y=1 - 0.18 / height, va="top", wrap=True)
+
+    def panel(row: int, column: int, name: str) -> Axes:
+        left, low = GAP + column * (wide + GAP), (1 - row) * (high + BELOW) + BELOW
+        axes = figure.add_axes((left / width, low / height, wide / width, high / height))
+        axes.set_title(name, fontsize=10, pad=4)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        return axes
+
+    def legend(axes: Axes, picture: ScalarMappable, words: str) -> None:
+        box = axes.get_position()
+        bar = figure.add_axes((box.x0, box.y0 - 0.2 / height, box.width, 0.12 / height))
+        figure.colorbar(picture, cax=bar, orientation="horizontal")
+        bar.tick_params(labelsize=8, length=2, pad=1)
+        bar.set_xlabel(words, fontsize=8, labelpad=1)
+
+    reference = panel(0, 0, "photograph")
+    reference.imshow(one.image.permute(1, 2, 0).numpy())
+    known = one.depth > 0
+    low, high_depth = depth_limits(one.depth, known)
+    depth = panel(0, 1, f"depth of {100 * float(known.float().mean()):.0f} % of the pixels")
+    depth.set_facecolor("0.9")
+    shown = np.where(known, one.depth, np.nan)
+    legend(depth, depth.imshow(shown, cmap="turbo_r", vmin=low, vmax=high_depth), "camera z [world units]")
+    certain = panel(1, 0, one.meaning)
+    picture = certain.imshow(one.certain.numpy(), cmap="gray", vmin=0, vmax=1)
+    legend(certain, picture, "0 nothing known, 1 certain" if one.meaning == "confidence" else "1 on the object")
+    cloud = panel(1, 1, f"{len(points):,} points, seen from {ASIDE:.0f} degrees to the side")
+    _draw_cloud(cloud, one.camera, points, colours, wide / high)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def _draw_cloud(axes: Axes, camera: CameraTensors, points: np.ndarray, colours: np.ndarray, shape: float) -> None:
     """The points as a camera sees them that went round their middle by some degrees, far ones first."""
-    axes.set_title(f"the {len(result.points)} points, seen from {degrees:.0f} degrees to the side")
-    axes.set_facecolor("white")
-    if len(result.points) == 0:
+    if len(points) == 0:
         return
-    R = result.camera.cam_from_world[:3, :3].double().numpy()
-    points = (result.points - np.median(result.points, axis=0)) @ R.T
-    angle = np.radians(degrees)
-    x = np.cos(angle) * points[:, 0] + np.sin(angle) * points[:, 2]
-    z = -np.sin(angle) * points[:, 0] + np.cos(angle) * points[:, 2]
+    chosen = np.random.default_rng(0).permutation(len(points))[:MOST_DRAWN]
+    R = camera.cam_from_world[:3, :3].double().numpy()
+    moved = (points[chosen] - np.median(points, axis=0)) @ R.T
+    angle = np.radians(ASIDE)
+    x = np.cos(angle) * moved[:, 0] + np.sin(angle) * moved[:, 2]
+    z = -np.sin(angle) * moved[:, 0] + np.cos(angle) * moved[:, 2]
     order = np.argsort(-z)
-    axes.scatter(x[order], points[order, 1], c=result.colours[order] / 255.0, s=4.0, marker="s", linewidths=0)
-    spans = [np.percentile(values, (0.5, 99.5)) for values in (x, points[:, 1])]
-    margin = 0.05 * max(high - low for low, high in spans) + 1e-9
-    axes.set_xlim(spans[0][0] - margin, spans[0][1] + margin)
-    axes.set_ylim(spans[1][1] + margin, spans[1][0] - margin)  # y points down
-    axes.set_aspect("equal")
+    axes.scatter(x[order], moved[order, 1], c=colours[chosen][order] / 255.0, s=2.0, marker="s", linewidths=0)
+    (left, right), (top, bottom) = (np.percentile(values, (1, 99)) for values in (x, moved[:, 1]))
+    # As wide and as high as shows all, in the panel's own shape.
+    half = 0.55 * max(bottom - top, (right - left) / shape) + 1e-9
+    axes.set_xlim((left + right) / 2 - shape * half, (left + right) / 2 + shape * half)
+    axes.set_ylim((top + bottom) / 2 + half, (top + bottom) / 2 - half)  # y points down

@@ -120,7 +120,7 @@ def _frusta(
         from scipy.spatial import cKDTree
 
         gaps = cKDTree(centers).query(centers, k=2)[0][:, 1]
-        length = float(np.clip(FRUSTUM_OF_GAP * np.median(gaps), 0.05, LONGEST_FRUSTUM))
+        length = float(np.clip(FRUSTUM_OF_GAP * np.median(gaps), 0.1, LONGEST_FRUSTUM))
     lines, colours = [], []
     for view, ((height, width), center) in enumerate(zip(sizes, centers, strict=True)):
         left, right, top, bottom = -0.5, width - 0.5, -0.5, height - 0.5

@@ -11,6 +11,7 @@ import torch
 from lsmgeo._checks import describe
 from lsmgeo.cameras import from_opencv
 from lsmgeo.data.assembling import as_data_error, assemble, check_intrinsics, check_picture, check_rotation
+from lsmgeo.data.depth_files import DepthPng
 from lsmgeo.data.files import child, has_alpha, image_size, refuse_unreadable
 from lsmgeo.data.json_files import peek_json, read_json, take_array, take_number, take_text
 from lsmgeo.data.posed import PosedImages
@@ -54,13 +55,16 @@ def read_cameras_json(path: str | Path) -> PosedImages:
                     "height": 480,
                     "K": [[...], [...], [...]],
                     "cam_from_world": [[...], [...], [...], [...]],
+                    "depth": "depth/a.png",
+                    "depth_step": 0.001,
                 },
                 ...,
             ],
         }
 
     A file without ``format`` is taken for one of version 1, ``name`` for ``file``, and ``R`` (3 x 3) with ``t`` (3) for
-    ``cam_from_world``.
+    ``cam_from_world``. ``depth`` may be left out: it is a 16-bit PNG of the photograph's size that counts steps of
+    camera z, ``depth_step`` world units each, 0 where there is none.
 
     Convention:
         World-to-camera, OpenCV axes; K may have skew. ``pixel_center`` is "integer" (also where it is left out) or
@@ -70,7 +74,7 @@ def read_cameras_json(path: str | Path) -> PosedImages:
         path: the file, or a folder with ``cameras.json``.
 
     Returns:
-        The photographs with their cameras, cut out where any of them has alpha; no sparse points.
+        The photographs with their cameras and depth, cut out where any of them has alpha; no sparse points.
 
     Raises:
         DataError: a file is missing, damaged or too large, names a file outside its folder, is of another version, or
@@ -90,7 +94,7 @@ def read_cameras_json(path: str | Path) -> PosedImages:
     if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_CAMERAS:
         raise DataError(file, f"cameras must be a list of 1 to {MOST_CAMERAS} cameras; got {describe(entries)}")
 
-    names, paths, sizes = [], [], []
+    names, paths, sizes, depths = [], [], [], []
     intrinsics, poses = np.zeros((len(entries), 3, 3)), np.zeros((len(entries), 3, 4))
     for view, entry in enumerate(entries):
         where = f"camera {view}"
@@ -104,11 +108,21 @@ def read_cameras_json(path: str | Path) -> PosedImages:
         check_intrinsics(intrinsics[view], file, where)
         poses[view] = _pose(entry, file, where)
         check_rotation(poses[view, :, :3], file, where)
+        depths.append(_depth(entry, file, where))
     height, width = torch.tensor(sizes).unbind(-1)
     K, R, t = (torch.from_numpy(array.copy()) for array in (intrinsics, poses[:, :, :3], poses[:, :, 3]))
     with as_data_error(file):
         cameras = from_opencv(K, R, t, height, width, pixel_center=center)
-    return assemble(names, paths, cameras, "cameras", file=file, cut_out=any(map(has_alpha, paths)))
+    return assemble(names, paths, cameras, "cameras", file=file, depths=depths, cut_out=any(map(has_alpha, paths)))
+
+
+def _depth(entry: dict[str, Any], file: Path, where: str) -> DepthPng | None:
+    if "depth" not in entry:
+        return None
+    step = take_number(entry, "depth_step", file, where)
+    if not step > 0:
+        raise DataError(file, f"{where}: depth_step must be positive; got {step:g}")
+    return DepthPng(child(file.parent, take_text(entry, "depth", file, where), file), step)
 
 
 def _size(entry: dict[str, Any], file: Path, where: str) -> tuple[int, int]:

@@ -181,15 +181,16 @@ def _depth(scene: PosedImages, examination: Examination, item: DepthMaps, title:
         other, known, errors = found[view]
         picture, zoom = _shown(scene, view)
         pixels = item.surfaces.pixels[view][known]
-        for axes, values, words in (
-            (left, item.surfaces.depths[view][known], "depth [world units]"),
-            (right, 100 * np.abs(errors), "difference [%]"),
+        for axes, values, words, colours in (
+            # Near is red and far is blue, as in all pictures of depth.
+            (left, item.surfaces.depths[view][known], "depth [world units]", "turbo_r"),
+            (right, 100 * np.abs(errors), "difference [%]", "turbo"),
         ):
             _show(axes, picture, zoom, alpha=0.5)
             high = float(np.percentile(values, 95)) if axes is left else max(4.0, 2 * 100 * medians[view])
             low = float(np.percentile(values, 5)) if axes is left else 0.0
             dots = axes.scatter(
-                *pixels.T, c=values, s=7, cmap="turbo", vmin=low, vmax=max(high, low + 1e-9), linewidths=0
+                *pixels.T, c=values, s=7, cmap=colours, vmin=low, vmax=max(high, low + 1e-9), linewidths=0
             )
             figure.colorbar(dots, ax=axes, label=words, shrink=0.85)
         left.set_title(f"depth of view {view} ({scene.names[view]})", fontsize=10)

@@ -1,5 +1,8 @@
 """``lsmgeo reconstruct`` on a plane known in closed form, from files in either format."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -41,33 +44,186 @@ def check_depth(depth, expected):
     assert np.quantile(errors, 0.95) < 1e-2
 
 
-def test_reconstruct_writes_the_depth_of_the_scene(scene, folder, tmp_path, capsys):
+def read_results(out):
+    """What a folder of results holds, read by code that shares nothing with the library: depth (V, h, w), entries."""
+    entries = json.loads((out / "cameras.json").read_text())["cameras"]
+    return [read_picture(out / entry["depth"]) * entry["depth_step"] for entry in entries], entries
+
+
+FILES = ["cameras.json", "model.glb", "model.ply", "points.ply", "report.html", "summary.png"]
+NORMAL = np.array([0.25, -0.15, 1.0]) / np.linalg.norm([0.25, -0.15, 1.0])
+
+
+def test_one_view_is_swept_to_the_depth_of_the_scene(scene, folder, tmp_path, capsys):
     out = tmp_path / "out"
-    assert cli.main(["reconstruct", str(folder), "--method", "sweep", "--view", "1", "--out", str(out)]) == 0
-    check_depth(np.load(out / "depth.npy"), scene.depth[1])
+    arguments = ["reconstruct", str(folder), "--method", "sweep", "--view", "1", "--out", str(out)]
+    assert cli.main([*arguments, "--resolution", "96"]) == 0
+    (depth,), (entry,) = read_results(out)
+    check_depth(depth, scene.depth[1])
+    np.testing.assert_allclose(entry["K"], scene.K[1], atol=1e-4)  # COLMAP's text keeps fewer digits
+    np.testing.assert_allclose(np.array(entry["cam_from_world"])[:3, 3], scene.t[1], atol=1e-4)
     printed = capsys.readouterr().out
     is_colmap = "middlebury" not in folder.name
     assert ("depth error: median" in printed) == is_colmap
-    names = ["depth.npy", "depth.png", "points.ply", "summary.png"]
-    assert sorted(path.name for path in out.iterdir()) == names
-    for name in names:
+    assert sorted(path.name for path in out.iterdir() if path.is_file()) == FILES
+    for name in ("model.glb", "points.ply", "report.html", "summary.png"):
         assert str((out / name).resolve()) in printed
-    assert read_picture(out / "depth.png").shape == (72, 96, 4)
+    name = Path(entry["file"]).name
+    assert read_picture(out / "pictures" / name).shape == (72, 96, 4)
+    assert read_picture(out / "images" / name).shape == (72, 96, 3)
     assert min(read_picture(out / "summary.png").shape[:2]) > 300
 
     import trimesh
 
-    cloud = trimesh.load(out / "points.ply")
-    normal = np.array([0.25, -0.15, 1.0]) / np.linalg.norm([0.25, -0.15, 1.0])
-    assert np.median(np.abs(np.asarray(cloud.vertices) @ normal)) < 2e-3
+    for model in ("points.ply", "model.ply", "model.glb"):
+        vertices = np.asarray(trimesh.load(out / model, force=None if "points" in model else "mesh").vertices)
+        assert len(vertices) > 1000
+        assert np.median(np.abs(vertices @ NORMAL)) < 2e-3
 
 
-def test_the_sixteen_bit_picture_holds_the_depth(scene, folder, tmp_path, capsys):
-    arguments = ["reconstruct", str(folder), "--view", "v0.png", "--out", str(tmp_path), "--depth_format", "png"]
+def test_all_views_are_swept_and_the_results_are_a_scene_again(scene, tmp_path, capsys):
+    """By names with folders and blanks, of which two differ in capitals alone."""
+    odd = scene._replace(names=["a/left.png", "a/Left.png", "b/left.png", "<b>&.png", "v 4.png"])
+    for name in odd.names:
+        (tmp_path / "scene" / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+    folder = write_colmap(odd, tmp_path / "scene", form="binary")
+    out = tmp_path / "out"
+    assert cli.main(["reconstruct", str(folder), "--out", str(out), "--resolution", "64"]) == 0
+    depths, entries = read_results(out)
+    photographs = [entry["photograph"] for entry in entries]
+    assert sorted(photographs) == sorted(odd.names)
+    assert len({Path(entry["file"]).name.lower() for entry in entries}) == 5
+    for depth, photograph in zip(depths, photographs, strict=True):
+        check_depth(depth, scene.depth[odd.names.index(photograph)])
+    assert "&lt;b&gt;&amp;.png" in (out / "report.html").read_text()
+    capsys.readouterr()
+    # What is written agrees with itself where info measures it: depth of one view in another.
+    assert cli.main(["info", str(out), "--out", str(tmp_path / "info")]) == 0
+    assert "depth" in capsys.readouterr().out
+    again = data.open(out)
+    torch.testing.assert_close(again.load_depth(0).double(), torch.from_numpy(depths[0]), rtol=1e-6, atol=0)
+
+
+def test_the_depth_range_and_the_planes_may_be_given(scene, folder, tmp_path):
+    arguments = ["reconstruct", str(folder), "--view", "v0.png", "--out", str(tmp_path), "--resolution", "32"]
     assert cli.main([*arguments, "--near", "1.5", "--far", "2.6", "--planes", "48"]) == 0
-    line = next(line for line in capsys.readouterr().out.splitlines() if "depth in steps of" in line)
-    unit = float(line.split("steps of ")[1].split(":")[0])
-    check_depth(read_picture(tmp_path / "depth16.png") * unit, scene.depth[0])
+    check_depth(read_results(tmp_path)[0][0], scene.depth[0])
+
+
+def write_ball(folder, *, background=None, views=8):
+    """A ball of radius 0.5 seen from all around: alpha, or before a colour."""
+    folder.mkdir(parents=True, exist_ok=True)
+    entries = []
+    v, u = np.mgrid[:96, :128]
+    rays = np.stack([(u - 63.5) / 150, (v - 47.5) / 150, np.ones_like(u)], -1)
+    for view in range(views):
+        angle, tilt = 2 * np.pi * view / views, 0.5 * (-1) ** view
+        center = 2.5 * np.array([np.cos(angle) * np.cos(tilt), np.sin(tilt), np.sin(angle) * np.cos(tilt)])
+        forward = -center / np.linalg.norm(center)
+        right = np.cross([0.0, 1.0, 0.0], forward)
+        right /= np.linalg.norm(right)
+        R = np.stack([right, np.cross(forward, right), forward])
+        directions = rays @ R
+        directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+        along = -(directions @ center)
+        on = np.sum(center**2) - along**2 < 0.25
+        picture = np.zeros((96, 128, 4), np.uint8)
+        picture[on] = (200, 120, 40, 255)
+        if background is not None:
+            picture[~on] = (*background, 255)
+        Image.fromarray(picture if background is None else picture[..., :3]).save(folder / f"{view}.png")
+        E = np.eye(4)
+        E[:3, :3], E[:3, 3] = R, -R @ center
+        K = [[150, 0, 63.5], [0, 150, 47.5], [0, 0, 1]]
+        entries.append({"file": f"{view}.png", "width": 128, "height": 96, "K": K, "cam_from_world": E.tolist()})
+    (folder / "cameras.json").write_text(json.dumps({"cameras": entries}))
+    return folder
+
+
+@pytest.mark.parametrize("background", [None, (0, 0, 0)])
+def test_a_hull_is_carved_coloured_and_written(tmp_path, capsys, background):
+    folder, out = write_ball(tmp_path / "ball", background=background), tmp_path / "out"
+    named = [] if background is None else ["--background", "black"]
+    arguments = ["reconstruct", str(folder), "--method", "hull", "--out", str(out), "--resolution", "48"]
+    assert cli.main([*arguments, *named]) == 0
+    assert "IoU" in capsys.readouterr().out
+
+    import trimesh
+
+    mesh = trimesh.load(out / "model.ply", force="mesh")
+    assert mesh.is_watertight
+    # Of eight views' hull the volume lies between the ball's and that of the cylinders around it.
+    assert 1.0 < mesh.volume / (4 / 3 * np.pi * 0.125) < 1.25
+    distance = np.linalg.norm(mesh.vertices, axis=1)
+    assert distance.min() > 0.48
+    assert np.median(distance) < 0.53
+    colours = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(int)
+    assert np.quantile(np.abs(colours - (200, 120, 40)).max(1), 0.9) < 40
+    depths, entries = read_results(out)
+    assert len(entries) == 8
+    middle = [depth[47:49, 63:65].mean() for depth in depths]
+    np.testing.assert_allclose(middle, 2.0, atol=0.06)
+
+
+def test_a_scene_without_silhouettes_has_no_hull_and_says_what_to_name(folder, tmp_path, capsys):
+    assert cli.main(["reconstruct", str(folder), "--method", "hull", "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert "--masks" in said
+    assert "--background" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_photographs_without_texture_give_a_warning_and_status_1(scene, tmp_path, capsys):
+    flat = scene._replace(images=np.full_like(scene.images, 90))
+    out = tmp_path / "out"
+    arguments = ["reconstruct", str(write_middlebury(flat, tmp_path / "scene")), "--near", "1.5", "--far", "2.6"]
+    assert cli.main([*arguments, "--view", "0", "--planes", "16", "--out", str(out)]) == 1
+    assert "warning: No pixel was kept" in capsys.readouterr().err
+    assert "No pixel was kept" in (out / "report.html").read_text()
+    assert not (out / "points.ply").exists()
+    assert not (out / "model.glb").exists()
+
+
+def test_a_damaged_photograph_is_left_out_and_named(scene, tmp_path, capsys):
+    folder, out = write_middlebury(scene, tmp_path / "scene"), tmp_path / "out"
+    content = (folder / "v1.png").read_bytes()
+    (folder / "v1.png").write_bytes(content[: len(content) // 2])
+    arguments = ["reconstruct", str(folder), "--planes", "64", "--out", str(out), "--resolution", "32"]
+    assert cli.main(arguments) == 0
+    said = capsys.readouterr().err
+    assert "warning: 1 photographs are left out" in said
+    assert "v1.png" in said
+    depths, entries = read_results(out)
+    assert [entry["photograph"] for entry in entries] == ["v0.png", "v2.png", "v4.png", "view_3.png"]
+    for depth, truth in zip(depths, scene.depth[[0, 2, 3, 4]], strict=True):
+        check_depth(depth, truth)
+    assert cli.main([*arguments, "--view", "v1.png"]) == 2
+    assert "v1.png" in capsys.readouterr().err
+
+
+def test_results_never_replace_the_photographs(scene, tmp_path, capsys):
+    folder = write_colmap(scene, tmp_path / "scene", form="text")
+    before = {path: path.read_bytes() for path in folder.rglob("*.png")}
+    assert cli.main(["reconstruct", str(folder), "--out", str(folder)]) == 2
+    assert "out must be a folder without the photographs" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in folder.rglob("*.png")} == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--method", "sweep", "--masks", "x"], "masks is for method hull; got method sweep"),
+        (["--method", "hull", "--near", "1"], "near is for method sweep; got method hull"),
+        (["--method", "hull", "--background", "0.1,x,2"], "background must be black, white or three numbers"),
+        (["--resolution", "2"], "resolution must be"),
+    ],
+)
+def test_options_of_the_other_method_are_refused(folder, tmp_path, capsys, arguments, message):
+    assert cli.main(["reconstruct", str(folder), "--out", str(tmp_path / "out"), *arguments]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_error_at_the_sparse_points_is_the_exact_one(scene, tmp_path):
@@ -160,7 +316,7 @@ def test_two_photographs_are_enough(scene, tmp_path):
     lines = file.read_text().splitlines()
     file.write_text("\n".join(["2", *lines[1:3]]))
     assert cli.main(["reconstruct", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
-    check_depth(np.load(tmp_path / "out" / "depth.npy"), scene.depth[0])
+    check_depth(read_results(tmp_path / "out")[0][0], scene.depth[0])
 
 
 def test_one_photograph_is_too_few(scene, tmp_path, capsys):

@@ -1,0 +1,223 @@
+"""From posed photographs with silhouettes to the surface of the visual hull, in the photographs' colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+from tqdm import tqdm
+
+from lsmgeo import functional
+from lsmgeo._checks import check_choice, check_whole
+from lsmgeo.cameras import CameraTensors, crop, resize, stack
+from lsmgeo.classical.silhouettes import signed_distance, silhouettes
+from lsmgeo.classical.surface import SurfaceMesh, drop_specks, extract_mesh
+from lsmgeo.classical.tsdf import voxel_side
+from lsmgeo.classical.visual_hull import RULES, default_grid, visual_hull
+from lsmgeo.errors import OptionError
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Sequence
+
+    from lsmgeo.data import PosedImages
+    from lsmgeo.grids import VoxelGrid
+
+__all__ = ["HullScene", "HullView", "colour_vertices", "hull_depth", "reconstruct_hull"]
+
+# Planes along a ray for every voxel that it crosses, and sites that are looked at in one go.
+PLANES_PER_VOXEL, SITES = 1.0, 1 << 24
+# How far behind the hull's depth, in voxels, a vertex may lie and still be seen.
+BEHIND = 2.0
+SPECK_FACES = 20
+
+
+@dataclass(frozen=True, eq=False)
+class HullView:
+    """One view of a hull, all maps of one size (h, w).
+
+    Attributes:
+        view: its number.
+        image: (3, h, w) the photograph.
+        camera: its camera at that size.
+        mask: (h, w) bool, the photograph's silhouette.
+        depth: (h, w) camera z where a ray first meets the hull, 0 where it misses.
+        iou: of the silhouette and of the hull's own.
+    """
+
+    view: int
+    image: Tensor
+    camera: CameraTensors
+    mask: Tensor
+    depth: Tensor
+    iou: float
+
+
+@dataclass(frozen=True, eq=False)
+class HullScene:
+    """A visual hull and how it looks in every view."""
+
+    views: tuple[HullView, ...]
+    occupancy: Tensor  # (D, H, W) bool
+    grid: VoxelGrid
+    mesh: SurfaceMesh
+
+
+def reconstruct_hull(
+    scene: PosedImages,
+    views: Sequence[int] | None = None,
+    *,
+    rule: str = "all",
+    folder: str | os.PathLike[str] | None = None,
+    background: str | Sequence[float] | None = None,
+    resolution: int = 192,
+    size: int = 640,
+    progress: bool = False,
+) -> HullScene:
+    """Carve the visual hull of a scene's silhouettes and colour its surface.
+
+    Args:
+        scene: posed photographs, see `lsmgeo.data.open`.
+        views: whose silhouettes carve; by default all.
+        rule: "all", a solid that lies in every silhouette; or "mean", in three quarters of them, which forgives wrong
+            silhouettes; see `lsmgeo.classical.visual_hull`.
+        folder: of mask files, see `lsmgeo.classical.silhouettes`.
+        background: the colour behind the object, see `lsmgeo.classical.silhouettes`.
+        resolution: voxels along the longest side of the hull's box.
+        size: longer side of the silhouettes in pixels; never larger than the photographs.
+        progress: whether to show a progress bar, one step a view.
+
+    Returns:
+        `HullScene`.
+
+    Raises:
+        OptionError: no silhouettes are there, one is empty, or nothing projects into all of them.
+        DataError: a photograph or a mask cannot be read.
+    """
+    who = "reconstruct_hull"
+    check_choice(who, "rule", rule, RULES)
+    check_whole(who, "resolution", resolution, 8, 1024)
+    check_whole(who, "size", size, 16)
+    chosen = list(range(len(scene)) if views is None else views)
+    found = silhouettes(scene, chosen, folder=folder, background=background)
+    for view, mask in zip(chosen, found, strict=True):
+        if not bool(mask.any()):
+            raise OptionError(f"{who}: the silhouette of view {view} ({scene.names[view]}) is empty")
+    height, width = scene.size(chosen[0])
+    scale = min(1.0, size / max(height, width))
+    shape = max(1, round(height * scale)), max(1, round(width * scale))
+    cameras = stack([resize(scene.camera(view), *shape) for view in chosen])
+    masks = torch.stack([_resized(mask[None].float(), shape)[0] > 0.5 for mask in found])
+    grid = default_grid(masks, cameras, resolution)
+    border = masks.clone()
+    border[:, 1:-1, 1:-1] = False
+    # An object that is cut off by a picture's border goes on beyond it.
+    outside = "unknown" if bool(border.any()) else "empty"
+    soft = torch.stack([signed_distance(mask) for mask in masks]) if rule == "all" else masks.float()
+    level = {"all": 0.0, "mean": 0.75}[rule]
+    hull = visual_hull(soft, cameras, grid, rule=rule, threshold=level, outside=outside)
+    if not bool(hull.occupancy.any()):
+        raise OptionError(f"{who}: no voxel lies in the silhouettes; rule='mean' forgives wrong ones")
+    looked = []
+    with tqdm(chosen, desc="hull", unit="view", disable=None if progress else True) as bar:
+        for index, view in enumerate(bar):
+            camera = CameraTensors(*(torch.as_tensor(value)[index] for value in cameras))
+            depth = hull_depth(hull.occupancy, grid, camera)
+            both = (depth > 0) & masks[index]
+            iou = float(both.sum()) / max(1, int(((depth > 0) | masks[index]).sum()))
+            looked.append(HullView(view, _resized(scene.load(view), shape), camera, masks[index], depth, iou))
+    mesh = drop_specks(extract_mesh(hull.support, grid, level=level), SPECK_FACES)
+    return HullScene(tuple(looked), hull.occupancy, grid, colour_vertices(mesh, looked, BEHIND * voxel_side(grid)))
+
+
+def hull_depth(occupancy: Tensor, grid: VoxelGrid, camera: CameraTensors) -> Tensor:
+    """Camera z where the rays of a camera first meet occupied voxels, to about a voxel.
+
+    Args:
+        occupancy: (D, H, W) bool.
+        grid: where it lives.
+        camera: leading shape ().
+
+    Returns:
+        (h, w) float32, the camera's size; 0 where a ray meets none.
+    """
+    height, width = int(torch.as_tensor(camera.height)), int(torch.as_tensor(camera.width))
+    depth = torch.zeros(height, width)
+    index = occupancy.nonzero()
+    if not len(index):
+        return depth
+    # The corners of the box of occupied voxels bound their depth, and where they are seen.
+    ends = torch.stack([index.amin(0).flip(0) - 0.5, index.amax(0).flip(0) + 0.5]).double()
+    T, E = grid.world_from_lattice.double(), camera.cam_from_world.double()
+    world = torch.cartesian_prod(*ends.unbind(1)) @ T[:3, :3].T + T[:3, 3]
+    corners = world @ E[:3, :3].T + E[:3, 3]
+    z = corners[:, 2]
+    step = voxel_side(grid) / PLANES_PER_VOXEL
+    nearest = float(z.min())
+    top, left, bottom, right = 0, 0, height, width
+    if nearest > step:
+        pixels = corners @ camera.intrinsics.double().T
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        (x0, y0), (x1, y1) = pixels.amin(0).floor().long().tolist(), pixels.amax(0).ceil().long().tolist()
+        top, left, bottom, right = max(0, y0), max(0, x0), min(height, y1 + 1), min(width, x1 + 1)
+    if top >= bottom or left >= right or float(z.max()) <= 0:
+        return depth
+    window = crop(stack([camera]), top, left, bottom - top, right - left)
+    size = bottom - top, right - left
+    seen = depth[top:bottom, left:right]
+    volume = occupancy[None, None].float()
+    planes = torch.arange(max(nearest, step) + step / 2, float(z.max()), step, dtype=torch.float64)
+    for slab in planes.split(max(1, SITES // (size[0] * size[1]))):
+        maps, _ = functional.plane_sweep_project(volume, window, grid, slab, size, mode="nearest")
+        hit = maps[0, 0] > 0.5
+        first = slab.float()[hit.to(torch.uint8).argmax(0)]
+        seen.copy_(torch.where((seen == 0) & hit.any(0), first, seen))
+    return depth
+
+
+def colour_vertices(mesh: SurfaceMesh, views: Sequence[HullView], behind: float) -> SurfaceMesh:
+    """A mesh with the mean of the colours that its vertices have in the photographs that see them.
+
+    A view counts by the fourth power of the cosine between its ray and the surface's normal, so that those that look
+    straight at a place decide.
+
+    Args:
+        mesh: of any size.
+        views: photographs, cameras and depth of the same surface.
+        behind: how far behind a view's depth a vertex may lie and still be seen, in world units.
+    """
+    import trimesh
+
+    if not len(mesh.vertices):
+        return mesh
+    normals = np.asarray(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals)
+    points = torch.from_numpy(mesh.vertices)[None]
+    total, weight = torch.zeros(3, len(mesh.vertices)), torch.zeros(len(mesh.vertices))
+    for view in views:
+        cameras = stack([view.camera])
+        colours, _ = functional.unproject_points(view.image[None, None], cameras, points)
+        depth, visible = functional.unproject_points(
+            view.depth[None, None, None], cameras, points, mode="nearest", augment=("depth",)
+        )
+        known, z = depth[0, 0]
+        E = view.camera.cam_from_world.double().numpy()
+        rays = -E[:3, :3].T @ E[:3, 3] - mesh.vertices
+        cosine = (rays * normals).sum(1) / np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
+        seen = visible[0, 0] & (known > 0) & (z < known + behind)
+        # Never nothing, so that what is seen at a grazing angle alone has a colour too.
+        each = torch.where(seen, torch.from_numpy(cosine).float().clamp_min(0.03) ** 4, 0.0)
+        total += each * colours[0, 0]
+        weight += each
+    mean = torch.where(weight > 0, total / weight.clamp_min(1e-12), 0.7)
+    rounded = (mean.T * 255).round().clamp(0, 255).to(torch.uint8).numpy()
+    return SurfaceMesh(mesh.vertices, mesh.faces, rounded)
+
+
+def _resized(image: Tensor, shape: tuple[int, int]) -> Tensor:
+    if tuple(image.shape[1:]) == shape:
+        return image
+    return interpolate(image[None], shape, mode="bilinear", antialias=True)[0].clamp(0, 1)

@@ -1,0 +1,248 @@
+"""The methods of ``lsmgeo reconstruct``: what is done for whole scenes, and what is told of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from lsmgeo.classical.hull_scene import HullView, reconstruct_hull
+from lsmgeo.classical.outputs import Looked, Results
+from lsmgeo.classical.reconstruct import Reconstruction, reconstruct_scene, reconstruct_view, surface_of
+from lsmgeo.classical.views import default_depth_range, select_neighbours
+from lsmgeo.errors import DataError, OptionError
+
+if TYPE_CHECKING:
+    from lsmgeo.classical.surface import SurfaceMesh
+    from lsmgeo.data import PosedImages
+
+__all__ = ["hull_results", "readable", "sweep_results"]
+
+MOST_NAMED = 5
+MOST_POINTS_OF_HULL = 500_000
+
+
+def readable(scene: PosedImages) -> tuple[PosedImages, tuple[str, ...]]:
+    """A scene without the photographs that cannot be read, and a note on those.
+
+    Returns:
+        The scene itself where all can be read.
+
+    Raises:
+        DataError: none can be read.
+    """
+    kept: list[int] = []
+    reasons: list[str] = []
+    for view in range(len(scene)):
+        try:
+            scene.load(view)
+        except DataError as error:
+            if len(scene) == len(reasons) + 1:
+                raise
+            reasons.append(str(error))
+        else:
+            kept.append(view)
+    if not reasons:
+        return scene, ()
+    points = scene.points
+    if points is not None:
+        points = points._replace(observations=tuple(points.observations[view] for view in kept))
+    fewer = replace(
+        scene,
+        names=tuple(scene.names[view] for view in kept),
+        paths=tuple(scene.paths[view] for view in kept),
+        cameras=type(scene.cameras)(*(torch.as_tensor(part)[kept] for part in scene.cameras)),
+        points=points,
+        lenses=None if scene.lenses is None else tuple(scene.lenses[view] for view in kept),
+        depths=None if scene.depths is None else tuple(scene.depths[view] for view in kept),
+    )
+    return fewer, (f"{len(reasons)} photographs are left out, as they cannot be read: {_some(reasons)}",)
+
+
+def sweep_results(
+    scene: PosedImages, view: int | None, title: str, *, resolution: int, density: float | None, **options: Any
+) -> Results:
+    """Plane-sweep stereo of one view, or of all that can be swept.
+
+    Args:
+        scene: posed photographs.
+        view: the one to sweep; None for all.
+        title: of what is written.
+        resolution: voxels along the longest side of the mesh's box.
+        density: largest fraction of the pixels to keep; None for the method's own.
+        options: of `lsmgeo.classical.reconstruct_view`.
+
+    Raises:
+        OptionError: an option out of range, or no view can be swept.
+        DataError: a photograph cannot be read.
+    """
+    if density is not None:
+        options |= {"density": density}
+    notes: tuple[str, ...] = ()
+    mesh: SurfaceMesh | None = None
+    views: tuple[Reconstruction, ...]
+    if view is not None:
+        one = reconstruct_view(scene, view, progress=True, **options)
+        views, points, colours = (one,), one.points, one.colours
+        mesh = surface_of(views, points, resolution) if len(points) else None
+    else:
+        able, notes = _able(scene, options)
+        found = reconstruct_scene(scene, able, resolution=resolution, progress=True, **options)
+        views, points, colours, mesh = found.views, found.points, found.colours, found.mesh
+    if not len(points):
+        notes += (
+            "No pixel was kept: nowhere do the photographs match with any certainty. They may lack texture, be too "
+            "far apart, or have wrong cameras (lsmgeo info tells), or the true depth lies outside near and far.",
+        )
+    facts = [("scene", f"{len(scene)} photographs, {scene.source}")]
+    first = views[0]
+    if view is not None:
+        matched = ", ".join(scene.names[other] for other in first.neighbours)
+        facts.append(("view", f"{view} ({scene.names[view]}), matched with {matched}"))
+    else:
+        facts.append(("views", f"{len(views)} of {len(scene)} swept, checked against each other and fused"))
+    height, width = first.mask.shape
+    low, high = min(float(one.depths[0]) for one in views), max(float(one.depths[-1]) for one in views)
+    facts.append(("sweep", f"{width} x {height} pixels, {len(first.depths)} planes from {low:.4g} to {high:.4g}"))
+    facts.append(("memory", f"at most {options['memory'] >> 20} MiB a sweep beyond the libraries and the photographs"))
+    pixels, whole = sum(int(one.mask.sum()) for one in views), sum(one.mask.numel() for one in views)
+    facts.append(("kept", f"{pixels} pixels, {100 * pixels / whole:.1f} %"))
+    errors = [one.error for one in views if one.error is not None and one.error.points]
+    if errors:
+        median = np.median([error.median for error in errors])
+        count, observed = sum(error.points for error in errors), sum(error.observed for error in errors)
+        of_views = "" if len(views) == 1 else ", median of the views'"
+        facts.append(
+            (
+                "depth error",
+                f"median {100 * median:.3f} % of the depth at {count} of {observed} sparse points{of_views}",
+            )
+        )
+    facts += _of_mesh(mesh)
+    used = tuple({other for one in views for other in one.neighbours})
+    return Results(title, tuple(facts), notes, tuple(map(_looked, views)), points, colours, mesh, used)
+
+
+def hull_results(
+    scene: PosedImages,
+    view: int | None,
+    title: str,
+    *,
+    rule: str,
+    masks: str | None,
+    background: str | None,
+    resolution: int,
+    size: int,
+) -> Results:
+    """The visual hull of all silhouettes.
+
+    Args:
+        scene: posed photographs.
+        view: the one from which the model is looked at first.
+        title: of what is written.
+        rule: see `lsmgeo.classical.reconstruct_hull`, like all further options.
+        masks: folder of mask files.
+        background: "black", "white", or three numbers from 0 to 1 with commas between.
+        resolution: voxels along the longest side.
+        size: longer side of the silhouettes.
+
+    Raises:
+        OptionError: no silhouettes are there, or they have no hull.
+        DataError: a photograph or a mask cannot be read.
+    """
+    colour: Any = background
+    if background is not None and "," in background:
+        try:
+            colour = tuple(float(part) for part in background.split(","))
+        except ValueError:
+            raise OptionError(
+                f"background must be black, white or three numbers such as 0.1,0.8,0.2; got {background!r}"
+            ) from None
+    try:
+        hull = reconstruct_hull(
+            scene, rule=rule, folder=masks, background=colour, resolution=resolution, size=size, progress=True
+        )
+    except OptionError as error:
+        if "no alpha" not in str(error):
+            raise
+        raise OptionError(f"{error}: --masks FOLDER, or --background white, black or R,G,B") from None
+    ious = [one.iou for one in hull.views]
+    depth, height, width = hull.occupancy.shape
+    volume = 100 * float(hull.occupancy.float().mean())
+    facts = [
+        ("scene", f"{len(scene)} photographs, {scene.source}"),
+        ("hull", f"of {len(ious)} silhouettes, {width} x {height} x {depth} voxels (x, y, z), {volume:.1f} % inside"),
+        ("silhouettes", f"IoU with the hull's own {np.mean(ious):.3f} on average, {min(ious):.3f} at least"),
+        *_of_mesh(hull.mesh),
+    ]
+    notes = []
+    worst = int(np.argmin(ious))
+    if ious[worst] < 0.8:
+        name = scene.names[hull.views[worst].view]
+        notes.append(
+            f"The hull fills only {100 * ious[worst]:.0f} % of the silhouette of {name}: silhouettes or cameras do not "
+            "agree with each other. Look at the silhouettes below, or try --rule mean."
+        )
+    ordered = sorted(hull.views, key=lambda one: one.view != view) if view is not None else hull.views
+    points, colours = hull.mesh.vertices, hull.mesh.colours
+    assert colours is not None
+    return Results(title, tuple(facts), tuple(notes), tuple(map(_looked_at_hull, ordered)), points, colours, hull.mesh)
+
+
+def _some(reasons: list[str]) -> str:
+    more = f"; and {len(reasons) - MOST_NAMED} more" if len(reasons) > MOST_NAMED else ""
+    return "; ".join(reasons[:MOST_NAMED]) + more
+
+
+def _able(scene: PosedImages, options: dict[str, Any]) -> tuple[list[int], tuple[str, ...]]:
+    """The views that have a depth range and neighbours, and a note on the others."""
+    able, reasons = [], []
+    stated = [value for value in (options.get("near"), options.get("far")) if value is not None]
+    if not all(0 < value < float("inf") for value in stated):
+        raise OptionError(f"near and far must be positive and finite; got {' and '.join(map(str, stated))}")
+    for view in range(len(scene)):
+        near, far = options.get("near"), options.get("far")
+        try:
+            if near is None or far is None:
+                lower, upper = default_depth_range(scene, view)
+                near, far = lower if near is None else near, upper if far is None else far
+            select_neighbours(scene, view, options["neighbours"], near=near, far=far)
+        except OptionError as error:
+            reasons.append((view, error))
+        else:
+            able.append(view)
+    if not able and reasons:
+        raise reasons[0][1]
+    if not reasons:
+        return able, ()
+    words = _some([f"{scene.names[view]}: {error}" for view, error in reasons])
+    return able, (f"{len(reasons)} views are not swept: {words}",)
+
+
+def _of_mesh(mesh: SurfaceMesh | None) -> list[tuple[str, str]]:
+    if mesh is None or not len(mesh.faces):
+        return []
+    return [("mesh", f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces")]
+
+
+def _looked(one: Reconstruction) -> Looked:
+    depth = torch.where(one.mask, one.depth_map.depth, 0.0)
+    numbers = [("kept", f"{100 * float(one.mask.float().mean()):.1f} %")]
+    if bool(one.mask.any()):
+        inside = one.depth_map.depth[one.mask]
+        numbers.append(("median depth", f"{float(inside.median()):.4g}"))
+    numbers.append(("swept", f"{float(one.depths[0]):.4g} to {float(one.depths[-1]):.4g}"))
+    numbers.append(("neighbours", ", ".join(map(str, one.neighbours))))
+    if one.support is not None and bool(one.mask.any()):
+        numbers.append(("other views that agree", f"{float(one.support[one.mask].float().mean()):.1f} on average"))
+    if one.error is not None and one.error.points:
+        numbers.append(("error at sparse points", f"{100 * one.error.median:.3f} % ({one.error.points} points)"))
+    confidence = one.depth_map.confidence
+    return Looked(one.view, one.image, one.camera, depth, confidence, "confidence", tuple(numbers))
+
+
+def _looked_at_hull(one: HullView) -> Looked:
+    numbers = (("IoU of silhouette and hull", f"{one.iou:.3f}"),)
+    return Looked(one.view, one.image, one.camera, one.depth, one.mask.float(), "silhouette", numbers)

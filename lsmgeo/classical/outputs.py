@@ -1,0 +1,166 @@
+"""What a reconstruction leaves behind: depth maps, pictures, points, a mesh, cameras, and a page."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+from lsmgeo.classical import pictures
+from lsmgeo.classical.report_model import Model
+from lsmgeo.classical.report_page import ReportPicture, ReportView, make_page
+from lsmgeo.classical.surface import write_mesh
+from lsmgeo.data.cameras_json import FORMAT, NAME, VERSION
+from lsmgeo.data.files import write_atomic, write_point_cloud
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from os import PathLike
+
+    from lsmgeo.cameras import CameraTensors
+    from lsmgeo.classical.surface import SurfaceMesh
+    from lsmgeo.data import PosedImages
+
+__all__ = ["Looked", "Results", "file_names", "write_results"]
+
+# The farthest depth of a map takes that many steps of its 16-bit picture.
+STEPS = 65_000
+LONGEST_NAME = 80
+
+
+class Looked(NamedTuple):
+    """One view of what was reconstructed, all maps of one size (h, w)."""
+
+    view: int
+    image: torch.Tensor  # (3, h, w)
+    camera: CameraTensors  # of that size
+    depth: torch.Tensor  # (h, w), 0 where none is known
+    certain: torch.Tensor  # (h, w) in [0, 1]
+    meaning: str  # of what is certain: "confidence", "silhouette"
+    numbers: tuple[tuple[str, str], ...]
+
+
+class Results(NamedTuple):
+    """What is written, beside the scene that it is of."""
+
+    title: str
+    facts: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...]
+    views: tuple[Looked, ...]
+    points: np.ndarray  # (N, 3)
+    colours: np.ndarray  # (N, 3) uint8
+    mesh: SurfaceMesh | None
+    used: tuple[int, ...] = ()  # photographs that helped, beside those of the views
+
+
+def write_results(scene: PosedImages, results: Results, folder: str | PathLike[str]) -> dict[str, Path]:
+    """Write results to a folder, where files of the same names are replaced; every file is there whole or not at all.
+
+    ``report.html`` is a page with everything, ``summary.png`` one picture of it; ``model.glb`` and ``model.ply`` are
+    the mesh, ``points.ply`` the points. ``images``, ``depth`` and ``pictures`` hold a PNG a view, named after its
+    photograph: the photograph at the size of its depth map, the depth as 16 bit, and in colours. ``cameras.json``
+    states the camera and the step of depth of each (see `lsmgeo.data.read_cameras_json`): the folder is a scene again.
+
+    Everything is made before the first file is written.
+
+    Returns:
+        For each thing where it is.
+
+    Raises:
+        DataError: something cannot be written.
+    """
+    folder = Path(folder)
+    names = file_names([scene.names[one.view] for one in results.views])
+    contents: dict[str, bytes] = {}
+    entries = []
+    for one, name in zip(results.views, names, strict=True):
+        step = max(float(one.depth.max()), 1e-30) / STEPS
+        height, width = one.depth.shape
+        shown = (one.image.permute(1, 2, 0) * 255).round().clamp(0, 255).to(torch.uint8).numpy()
+        contents[f"images/{name}.png"] = pictures.png(shown)
+        contents[f"depth/{name}.png"] = pictures.depth_as_png16(one.depth, step)
+        contents[f"pictures/{name}.png"] = pictures.png(pictures.coloured_depth(one.depth, one.depth > 0))
+        entries.append(
+            {
+                "file": f"images/{name}.png",
+                "photograph": scene.names[one.view],
+                "width": width,
+                "height": height,
+                "K": one.camera.intrinsics.double().tolist(),
+                "cam_from_world": one.camera.cam_from_world.double().tolist(),
+                "depth": f"depth/{name}.png",
+                "depth_step": step,
+            }
+        )
+    stated = {"format": FORMAT, "version": VERSION, "pixel_center": "integer", "cameras": entries}
+    summary = pictures.summary(results.views[0], results.points, results.colours, results.title)
+    page = make_page(
+        results.title,
+        facts=results.facts,
+        notes=results.notes,
+        views=[_view_of(scene, one) for one in results.views],
+        model=_model_of(scene, results),
+    )
+    written = {}
+    if results.mesh is not None and len(results.mesh.faces):
+        written["mesh"] = write_mesh(folder / "model.glb", results.mesh)
+        write_mesh(folder / "model.ply", results.mesh)
+    if len(results.points):
+        written["points"] = write_point_cloud(folder / "points.ply", results.points, results.colours)
+    written["page"] = write_atomic(folder / "report.html", page.encode())
+    written["summary"] = write_atomic(folder / "summary.png", summary)
+    for name, content in contents.items():
+        write_atomic(folder / name, content)
+    written["depth, 16 bit"] = folder / "depth"
+    written["depth in colours"] = folder / "pictures"
+    # Last, so that it never names what is not there.
+    written["cameras"] = write_atomic(folder / NAME, json.dumps(stated, indent=1, allow_nan=False).encode())
+    return written
+
+
+def file_names(names: Sequence[str]) -> list[str]:
+    """Names for files, without an ending, told from names that may hold folders and any characters; none is twice.
+
+    Example:
+        >>> file_names(["left/a.png", "a.jpg", "A.png", "../a b:c.png", ""])
+        ['left_a', 'a', 'A_2', 'a_b_c', 'view']
+    """
+    taken: set[str] = set()
+    made = []
+    for name in names:
+        parts = (
+            [part for part in PurePosixPath(name.replace("\\", "/")).with_suffix("").parts if part != ".."]
+            if name
+            else []
+        )
+        plain = re.sub(r"[^\w.-]+", "_", "_".join(parts)).strip("._-")[:LONGEST_NAME] or "view"
+        unique, number = plain, 1
+        # Some systems do not tell capitals from small letters.
+        while unique.lower() in taken:
+            number += 1
+            unique = f"{plain}_{number}"
+        taken.add(unique.lower())
+        made.append(unique)
+    return made
+
+
+def _view_of(scene: PosedImages, one: Looked) -> ReportView:
+    shown = (one.image.permute(1, 2, 0) * 255).round().clamp(0, 255).to(torch.uint8).numpy()
+    limits = pictures.depth_limits(one.depth, one.depth > 0)
+    drawn = [
+        ReportPicture("photograph", shown, "photograph"),
+        ReportPicture("depth [world units]", one.depth.numpy(), "depth", limits),
+        ReportPicture(one.meaning, one.certain.numpy(), "confidence"),
+    ]
+    return ReportView(one.view, scene.names[one.view], drawn, one.numbers)
+
+
+def _model_of(scene: PosedImages, results: Results) -> Model | None:
+    if not len(results.points) and (results.mesh is None or not len(results.mesh.faces)):
+        return None
+    used = (*(one.view for one in results.views), *results.used)
+    return Model(scene.cameras, used, results.mesh, results.points, results.colours)

@@ -26,6 +26,8 @@ RULES = ("mean", "all")
 BYTES_OF_A_SITE = 32
 # Voxels along an axis of the coarse hulls from which a box is told, and how often it is told anew.
 COARSE, ROUNDS, GROWTHS = 32, 3, 4
+# Rays that are parallel to about a degree meet nowhere.
+LARGEST_CONDITION = 1e4
 
 # A map (h, w) and its camera, of that size.
 Picture = tuple[Tensor, CameraTensors]
@@ -162,7 +164,7 @@ def hull_box(
 
     A cube about the point nearest to the rays through the middles of the silhouettes, as large as these say, is carved
     coarsely, with silhouettes widened by the reach of a voxel so that nothing thin is lost; the box around what stays
-    is carved again. With views from about one side the hull has no end along their rays, and the box is cut off.
+    is carved again. Where two views leave the hull without an end, the box is cut off.
 
     Args:
         masks: (h, w) bool of every view, not empty; sizes may differ.
@@ -173,7 +175,8 @@ def hull_box(
         Lower and upper corner as x, y, z.
 
     Raises:
-        OptionError: a silhouette is empty, nothing projects into all of them, or margin is negative.
+        OptionError: a silhouette is empty, all are from one direction, nothing projects into all of them, or margin is
+            negative.
     """
     who = "hull_box"
     tensors = as_tensors(cameras, who)
@@ -233,10 +236,9 @@ def _ball(pictures: Sequence[Picture]) -> tuple[np.ndarray, float]:
         left, right = left + across, right + across @ origin
         cosine = (on @ axis).min().clip(0.1, 1.0)
         spans.append((origin, np.sqrt(1 - cosine**2) / cosine))
-    if len(pictures) > 1 and np.linalg.cond(left) < 1e6:
-        middle = np.linalg.solve(left, right)
-    else:  # rays that meet nowhere: something as large as it is far
-        middle = spans[0][0] + axis
+    if len(pictures) < 2 or not np.linalg.cond(left) < LARGEST_CONDITION:
+        raise OptionError("hull_box: silhouettes from one direction bound nothing along it; give a grid of your own")
+    middle = np.linalg.solve(left, right)
     radius = max(tangent * np.linalg.norm(middle - origin) for origin, tangent in spans)
     return middle, float(1.5 * radius)
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import adaptive_max_pool2d, pad
 
 from lsmgeo import functional
 from lsmgeo._checks import check_choice, check_geometry, check_number, check_whole, describe
@@ -26,6 +26,8 @@ RULES = ("mean", "all")
 BYTES_OF_A_SITE = 32
 # Voxels along an axis of the coarse hulls from which a box is told, and how often it is told anew.
 COARSE, ROUNDS, GROWTHS = 32, 3, 4
+# Pixels of a silhouette's longer side from which a box is told.
+LONGEST_SIDE = 256
 # Rays that are parallel to about a degree meet nowhere.
 LARGEST_CONDITION = 1e4
 
@@ -189,7 +191,7 @@ def hull_box(
     for view, mask in enumerate(masks):
         if not bool(mask.any()):
             raise OptionError(f"{who}: the silhouette of view {view} is empty")
-    pictures = [(mask, resize(select(tensors, 0, view), *mask.shape)) for view, mask in enumerate(masks)]
+    pictures = [_thinned(mask, select(tensors, 0, view)) for view, mask in enumerate(masks)]
     middle, radius = _ball(pictures)
     wide = [_with_rim(mask, camera) for mask, camera in pictures]
     lower, upper = middle - radius, middle + radius
@@ -241,6 +243,14 @@ def _ball(pictures: Sequence[Picture]) -> tuple[np.ndarray, float]:
     middle = np.linalg.solve(left, right)
     radius = max(tangent * np.linalg.norm(middle - origin) for origin, tangent in spans)
     return middle, float(1.5 * radius)
+
+
+def _thinned(mask: Tensor, camera: CameraTensors) -> Picture:
+    """A silhouette of no more pixels than coarse voxels need; one that the object touches stays on it."""
+    scale = min(1.0, LONGEST_SIDE / max(mask.shape))
+    height, width = (max(1, round(side * scale)) for side in mask.shape)
+    small = adaptive_max_pool2d(mask[None].to(torch.float32), (height, width))[0] > 0
+    return small, resize(camera, height, width)
 
 
 def _with_rim(mask: Tensor, camera: CameraTensors) -> Picture:

@@ -54,7 +54,8 @@ def fuse_depth(
     sections 3 and 5.)
 
     Between pixels inverse depth is interpolated, which is exact on planes; next to a bend by more than the truncation,
-    as at a jump, and next to pixels without depth, the nearest pixel's is taken.
+    as at a jump, and next to pixels without depth, the nearest pixel's is taken. Cracks are closed first: a pixel
+    without depth between opposite neighbours whose depths differ by less than the truncation takes their mean.
 
     Convention:
         Depth is camera z, 0 where there is none: such pixels say nothing, unless they are `background`. Integer pixel
@@ -208,7 +209,7 @@ def _feature_maps(maps: _Maps, camera: CameraTensors, truncation: float) -> tupl
     """What is interpolated: inverse depth and roughness; and what is not: inverse depth and weight, 0 if unknown."""
     depth = maps.depth
     has_depth = depth > 0
-    inverse = torch.where(has_depth, 1 / torch.where(has_depth, depth, 1), 0)
+    inverse = _without_cracks(torch.where(has_depth, 1 / torch.where(has_depth, depth, 1), 0), truncation)
     rough = _is_rough(inverse, truncation)
     weight = _cosine(inverse, camera)
     if maps.background is not None:
@@ -221,6 +222,21 @@ def _feature_maps(maps: _Maps, camera: CameraTensors, truncation: float) -> tupl
     smooth = torch.stack((inverse, rough.to(depth.dtype)))
     nearest = torch.stack((inverse, weight))
     return smooth[None, None], nearest[None, None]
+
+
+def _without_cracks(inverse: Tensor, truncation: float) -> Tensor:
+    """Inverse depth (h, w) in which a pixel that has none takes the mean of opposite neighbours that agree."""
+    height, width = inverse.shape
+    wide = pad(inverse, (1, 1, 1, 1))
+    total, count = torch.zeros_like(inverse), torch.zeros_like(inverse)
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        first = wide[1 + down : 1 + down + height, 1 + right : 1 + right + width]
+        second = wide[1 - down : 1 - down + height, 1 - right : 1 - right + width]
+        # |1 / first - 1 / second| < truncation; false where one has no depth.
+        agrees = (first - second).abs() < truncation * first * second
+        total += torch.where(agrees, (first + second) / 2, 0)
+        count += agrees
+    return torch.where((inverse == 0) & (count > 0), total / count.clamp_min(1), inverse)
 
 
 def _is_rough(inverse: Tensor, truncation: float) -> Tensor:

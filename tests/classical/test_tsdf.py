@@ -204,6 +204,35 @@ def test_what_has_no_depth_says_nothing_and_background_is_empty():
         assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.4).max() * 20 < 0.25
 
 
+def test_cracks_are_closed_and_holes_are_not():
+    cameras, normal = one_camera(), np.array([0.5, 0.3, -1.0])
+    depth = torch.tensor(plane_depth(cameras, normal, 0.04))[None]
+    grid = VoxelGrid(16, -0.3, 0.3)
+    whole = fuse_depth(depth, cameras.tensors(), grid, truncation=0.3)
+    cracked = depth.clone()
+    cracked[0, :, 20], cracked[0, 17, :] = 0, 0
+    cracked[0, range(30), range(8, 38)] = 0
+    closed = fuse_depth(cracked, cameras.tensors(), grid, truncation=0.3)
+    # Where two cracks cross nothing is opposite; elsewhere a plane is a plane.
+    lost = (whole.weight > 0) & (closed.weight == 0)
+    assert lost.double().mean() < 0.01
+    torch.testing.assert_close(closed.distance[~lost], whole.distance[~lost], rtol=0, atol=0.02)
+    assert (closed.distance - whole.distance)[~lost].abs().median() < 1e-9
+    # A crack along a jump stays open, and so does one of which it is known that nothing is there.
+    step = torch.full((1, 32, 32), 3.0)
+    step[:, :, 17:], step[:, :, 16] = 2.0, 0.0
+    flat = torch.full((1, 32, 32), 2.0)
+    flat[:, :, 16] = 0.0
+    column = VoxelGrid((9, 1, 1), (0.5 * 2 / 40 - 0.01, -0.01, 1.9), (0.5 * 2 / 40 + 0.01, 0.01, 2.1))
+    camera = straight_camera().tensors()
+    assert (fuse_depth(step, camera, column).weight == 0).all()
+    assert (fuse_depth(flat, camera, column).weight[:5] > 0).all()
+    empty = flat == 0
+    empty[:, :, 15:18] = True  # the rim of background is left out
+    fused = fuse_depth(flat, camera, column, background=empty, truncation=0.05)
+    torch.testing.assert_close(fused.distance, torch.full((9, 1, 1), 0.05))
+
+
 def test_colours_are_those_of_the_surface():
     cameras, grid = all_round(), VoxelGrid(24)
     depth, points = cameras.see(BALL)

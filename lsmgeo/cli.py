@@ -201,7 +201,7 @@ def reconstruct(
         print(f"{what + ':':<18}{path.resolve()}")
     for note in results.notes:
         print(f"lsmgeo: warning: {note}", file=sys.stderr)
-    return 0 if len(results.points) else 1
+    return 0 if len(results.points) or results.mesh is not None else 1
 
 
 def render(

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 __all__ = ["hull_results", "readable", "sweep_results"]
 
 MOST_NAMED = 5
-MOST_POINTS_OF_HULL = 500_000
 
 
 def readable(scene: PosedImages) -> tuple[PosedImages, tuple[str, ...]]:
@@ -186,9 +185,8 @@ def hull_results(
             "agree with each other. Look at the silhouettes below, or try --rule mean."
         )
     ordered = sorted(hull.views, key=lambda one: one.view != view) if view is not None else hull.views
-    points, colours = hull.mesh.vertices, hull.mesh.colours
-    assert colours is not None
-    return Results(title, tuple(facts), tuple(notes), tuple(map(_looked_at_hull, ordered)), points, colours, hull.mesh)
+    nothing = np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8)
+    return Results(title, tuple(facts), tuple(notes), tuple(map(_looked_at_hull, ordered)), *nothing, hull.mesh)
 
 
 def _some(reasons: list[str]) -> str:

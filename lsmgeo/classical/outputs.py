@@ -51,7 +51,7 @@ class Results(NamedTuple):
     facts: tuple[tuple[str, str], ...]
     notes: tuple[str, ...]
     views: tuple[Looked, ...]
-    points: np.ndarray  # (N, 3)
+    points: np.ndarray  # (N, 3); none of a hull, whose mesh says all
     colours: np.ndarray  # (N, 3) uint8
     mesh: SurfaceMesh | None
     used: tuple[int, ...] = ()  # photographs that helped, beside those of the views
@@ -97,7 +97,10 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
             }
         )
     stated = {"format": FORMAT, "version": VERSION, "pixel_center": "integer", "cameras": entries}
-    summary = pictures.summary(results.views[0], results.points, results.colours, results.title)
+    mesh, points, colours = results.mesh, results.points, results.colours
+    if not len(points) and mesh is not None and mesh.colours is not None:
+        points, colours = mesh.vertices, mesh.colours
+    summary = pictures.summary(results.views[0], points, colours, results.title)
     page = make_page(
         results.title,
         facts=results.facts,
@@ -106,9 +109,9 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
         model=_model_of(scene, results),
     )
     written = {}
-    if results.mesh is not None and len(results.mesh.faces):
-        written["mesh"] = write_mesh(folder / "model.glb", results.mesh)
-        write_mesh(folder / "model.ply", results.mesh)
+    if mesh is not None and len(mesh.faces):
+        written["mesh"] = write_mesh(folder / "model.glb", mesh)
+        write_mesh(folder / "model.ply", mesh)
     if len(results.points):
         written["points"] = write_point_cloud(folder / "points.ply", results.points, results.colours)
     written["page"] = write_atomic(folder / "report.html", page.encode())

@@ -74,7 +74,7 @@ def summary(one: Looked, points: np.ndarray, colours: np.ndarray, title: str) ->
 
     Args:
         one: the view.
-        points: (N, 3) of all views.
+        points: (N, 3) of the model.
         colours: (N, 3) uint8.
         title: to write above.
     """
@@ -118,7 +118,7 @@ def summary(one: Looked, points: np.ndarray, colours: np.ndarray, title: str) ->
     certain = panel(1, 0, one.meaning)
     picture = certain.imshow(one.certain.numpy(), cmap="gray", vmin=0, vmax=1)
     legend(certain, picture, "0 nothing known, 1 certain" if one.meaning == "confidence" else "1 on the object")
-    cloud = panel(1, 1, f"{len(points):,} points, seen from {ASIDE:.0f} degrees to the side")
+    cloud = panel(1, 1, f"the model, seen from {ASIDE:.0f} degrees to the side")
     _draw_cloud(cloud, one.camera, points, colours, wide / high)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
@@ -136,7 +136,7 @@ def _draw_cloud(axes: Axes, camera: CameraTensors, points: np.ndarray, colours: 
     x = np.cos(angle) * moved[:, 0] + np.sin(angle) * moved[:, 2]
     z = -np.sin(angle) * moved[:, 0] + np.cos(angle) * moved[:, 2]
     order = np.argsort(-z)
-    axes.scatter(x[order], moved[order, 1], c=colours[chosen][order] / 255.0, s=2.0, marker="s", linewidths=0)
+    axes.scatter(x[order], moved[order, 1], c=colours[chosen][order] / 255.0, s=3.0, marker="s", linewidths=0)
     (left, right), (top, bottom) = (np.percentile(values, (1, 99)) for values in (x, moved[:, 1]))
     # As wide and as high as shows all, in the panel's own shape.
     half = 0.55 * max(bottom - top, (right - left) / shape) + 1e-9

@@ -11,14 +11,16 @@ function lookFrom(place, forward, up, field) {
   render();
 }
 
-function lookAtStart() {
-  // A window higher than wide sees less to the sides.
-  lookFrom([0, 0, settings.distance / Math.min(1, camera.aspect)], [0, 0, -1], [0, 1, 0], settings.field);
-}
-
+// All that the photograph shows is in the window, whatever its shape.
 function lookAsView(view) {
   const stand = settings.stands[view];
-  lookFrom(stand.slice(0, 3), stand.slice(3, 6), stand.slice(6, 9), Math.min(100, stand[9]));
+  const [high, wide] = stand.slice(9);
+  const field = 2 * Math.atan(Math.max(high, wide / camera.aspect)) * 180 / Math.PI;
+  lookFrom(stand.slice(0, 3), stand.slice(3, 6), stand.slice(6, 9), Math.min(110, 1.05 * field));
+}
+
+function lookAtStart() {
+  lookAsView(settings.first);
 }
 
 function shade(shaded) {

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 __all__ = ["Model", "make_viewer"]
 
 MOST_FACES, MOST_POINTS = 250_000, 200_000
-# Degrees of the field of view at the start, and how much of it is left around the model.
-FIELD, MARGIN = 40.0, 1.0
 # Of the model, whose middle is the origin and whose radius is 1: how long a frustum may be, and of the way to its
 # nearest neighbour.
 LONGEST_FRUSTUM, FRUSTUM_OF_GAP = 0.35, 0.6
@@ -84,16 +82,15 @@ def make_viewer(model: Model) -> str:
         cloud = trimesh.PointCloud(placed(model.points[chosen]), colors=_opaque(model.colours[chosen]))
         scene.add_geometry(cloud, node_name="points", geom_name="points")
     scene.add_geometry(_frusta(model, K, E, sizes, centers, turn), node_name="cameras", geom_name="cameras")
-    distance = MARGIN / np.sin(np.radians(FIELD / 2))
-    scene.set_camera(angles=(0, 0, 0), distance=distance, center=(0, 0, 0), fov=(FIELD, FIELD))
+    # The script places the camera; without one trimesh would look for a place itself.
+    scene.set_camera(angles=(0, 0, 0), distance=3, center=(0, 0, 0))
     stands = []
     for view in range(len(K)):
         axes = E[view, :3, :3] @ turn.T  # rows: right, down, forward
-        field = 2 * np.degrees(np.arctan(0.5 * sizes[view, 0] / K[view, 1, 1]))
-        stands.append(np.concatenate([centers[view], axes[2], -axes[1], [field]]).round(6).tolist())
+        halves = 0.5 * sizes[view] / (K[view, 1, 1], K[view, 0, 0])  # tangents of half the field, up and aside
+        stands.append(np.concatenate([centers[view], axes[2], -axes[1], halves]).round(6).tolist())
     settings = {
-        "distance": distance,
-        "field": FIELD,
+        "first": model.used[0],
         "stands": stands,
         "shaded": model.surface is not None and model.surface.colours is None,
     }

@@ -25,7 +25,7 @@ def cameras_around(count=4, distance=4.0):
     for angle in np.linspace(0, np.pi, count):
         c, s = np.cos(angle), np.sin(angle)
         poses.append([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, distance], [0, 0, 0, 1]])
-    K = torch.tensor([[100.0, 0, 79.5], [0, 100, 59.5], [0, 0, 1]], dtype=torch.float64)
+    K = torch.tensor([[180.0, 0, 79.5], [0, 180, 59.5], [0, 0, 1]], dtype=torch.float64)
     full = torch.full((count,), 120), torch.full((count,), 160)
     return CameraTensors(K.expand(count, 3, 3), torch.tensor(poses, dtype=torch.float64), *full)
 

@@ -1,11 +1,12 @@
 """Depth of textured surfaces known in closed form, by plane sweep: ``python -m benchmarks.classical_analytic``.
 
-The pictures are traced by `tests.classical.analytic`, which shares no code with the library: 96 x 72 pixels, four views,
-64 planes even in inverse depth, 5 x 5 correlation; pixels nearer than three to the surface's end are left out.
+The pictures are traced by `tests.classical.analytic`, which shares no code with the library: 96 x 72 pixels, four
+views, 64 planes even in inverse depth, 5 x 5 correlation; pixels nearer than three to the surface's end are left out.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -43,10 +44,8 @@ def rows(root: Path | None = None) -> list[Row]:
     """The table's lines; the folder of sets is not used. The worse of two textures counts."""
     found = []
     for surface in (*analytic.SURFACES, "corner"):
-        within, median, _ = (
-            worst(values)
-            for worst, values in zip((min, max, max), zip(*(errors(surface, seed=s) for s in SEEDS)), strict=True)
-        )
+        measured = [errors(surface, seed=seed) for seed in SEEDS]
+        within, median = min(values[0] for values in measured), max(values[1] for values in measured)
         least = LEAST_BOX if surface == "box" else LEAST
         # Of a corner all faces are steep: windows that face the camera lie on none of them.
         is_goal = surface != "corner"
@@ -69,7 +68,7 @@ def rows(root: Path | None = None) -> list[Row]:
         ]
     for surface in ("slanted", "sphere"):
         medians = [errors(surface, planes)[2] for planes in (16, 32, 64)]
-        ratios = [first / second for first, second in zip(medians, medians[1:], strict=False)]
+        ratios = [first / second for first, second in pairwise(medians)]
         found.append(
             Row(
                 f"analytic {surface}",

@@ -75,24 +75,30 @@ class Correlation:
         for part, factors in columns:
             out[:, part] *= factors
 
-    def compare(self, warped: Floats, out: Floats, room: Floats | None = None) -> None:
+    def compare(self, warped: Floats, out: Floats) -> None:
         """Write the costs (h, w) of one warped image (h, w)."""
-        mean, energy, product = self._room(3) if room is None else room[:3]
+        self._correlate(warped, out, self._room(3))
+        np.add(out, 1, out=out)
+
+    def _correlate(self, warped: Floats, out: Floats, room: Floats) -> None:
+        """Write the costs less 1."""
+        import cv2
+
+        mean, energy, product = room[:3]
         self._average(warped, mean)
         np.multiply(warped, warped, out=product)
         self._average(product, energy)
         np.multiply(mean, mean, out=product)
-        np.subtract(energy, product, out=energy)
-        np.maximum(energy, 0, out=energy)
-        np.add(energy, np.float32(self.noise**2), out=energy)
+        cv2.addWeighted(energy, 1, product, -1, self.noise**2, dst=energy)
+        # A variance of 0 may come out as a little less.
+        np.maximum(energy, np.float32(self.noise**2), out=energy)
         np.sqrt(energy, out=energy)
         np.multiply(warped, self.reference, out=out)
         self._average(out, product)
         np.multiply(mean, self.mean, out=mean)
         np.subtract(product, mean, out=product)
         np.multiply(product, self.scale, out=product)
-        np.divide(product, energy, out=product)
-        np.add(product, 1, out=out)
+        np.divide(product, energy, out=out)
 
     def aggregate(self, warped: Floats, visible: Mask, best: int, min_views: int, out: Floats, seen: Mask) -> None:
         """Write the mean cost (h, w) of the best neighbours, and where enough see a site, for one plane.
@@ -109,7 +115,7 @@ class Correlation:
         room = self._room(number + 4)
         costs, spare = list(room[4:]), room[3]
         for neighbour in range(number):
-            self.compare(warped[neighbour], costs[neighbour], room)
+            self._correlate(warped[neighbour], costs[neighbour], room)
         all_see = bool(visible.all())
         if not all_see:
             for cost, sees in zip(costs, visible, strict=True):
@@ -127,6 +133,7 @@ class Correlation:
             for cost in costs[1:best]:
                 np.add(total, cost, out=total)
             np.multiply(total, np.float32(1 / best), out=out)
+            np.add(out, 1, out=out)
             return
         count = np.add.reduce(visible.view(np.uint8), axis=0, dtype=np.uint8 if number < 256 else np.int32)
         np.greater_equal(count, min_views, out=seen)
@@ -136,6 +143,7 @@ class Correlation:
         for cost in costs[1:best]:
             np.add(total, cost, out=total)
         np.divide(total, np.clip(count, 1, best).astype(np.float32), out=out)
+        np.add(out, 1, out=out)
         np.copyto(out, np.float32(UNRELATED), where=~seen)
 
 

@@ -133,13 +133,12 @@ def sweep(
             ):
                 if cost_filter is not None:
                     cost = cost_filter(cost)
-                for plane, is_seen in zip(cost, seen, strict=True):
-                    winners.push(plane, is_seen)
+                winners.push(cost, seen)
                 bar.update(len(cost))
-        correlation = (1 - winners.best).clamp(0, 1)
-        confidence = correlation * winners.uniqueness().sqrt() * _agreement(winners.place)
-        confidence = torch.where(winners.place >= 0, confidence, 0.0)
-        return DepthMap(winners.depth(), confidence, winners.best.clamp_max(UNRELATED), winners.place)
+        cost, place = torch.from_numpy(winners.best), torch.from_numpy(winners.place)
+        confidence = (1 - cost).clamp(0, 1) * winners.uniqueness().sqrt() * _agreement(place)
+        confidence = torch.where(place >= 0, confidence, 0.0)
+        return DepthMap(*(values.to(images.device) for values in (winners.depth(), confidence, cost, place)))
 
 
 def _planes_apart(cameras: Cameras, depths: Tensor, size: tuple[int, int]) -> float:

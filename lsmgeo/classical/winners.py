@@ -1,14 +1,21 @@
-"""The lowest and second-lowest local minimum of a cost along every ray, from planes that come one by one."""
+"""The lowest and second-lowest local minimum of a cost along every ray, from planes that come slab by slab."""
 
 from __future__ import annotations
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
+
+from lsmgeo.classical.correlation import on_threads
 
 __all__ = ["Winners"]
 
 # A second minimum counts against the first only where it is another place, not the noise around the same one.
 SAME_PLANES = 2.5
+
+Floats = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
 
 
 class Winners:
@@ -20,64 +27,73 @@ class Winners:
     Args:
         depths: (P,) the planes' depths, ascending.
         size: (h, w).
-        unrelated: the cost of what nobody sees.
+        unrelated: what nobody sees costs; only what costs less can win.
         apart: planes within which minima are one place.
     """
 
     def __init__(self, depths: Tensor, size: tuple[int, int], unrelated: float, apart: float = SAME_PLANES):
+        self.inverse = (1 / depths.detach().cpu().double()).numpy()
         self.apart = max(apart, SAME_PLANES)
-        self.inverse = (1 / depths.double()).tolist()
-        self.unrelated = unrelated
-        self.before: list[tuple[Tensor, Tensor]] = []
         self.count = 0
-        self.best = torch.full(size, 2 * unrelated, device=depths.device)
-        self.second = torch.full(size, unrelated, device=depths.device)
-        self.place = torch.full(size, -1.0, device=depths.device)
+        self.before: tuple[Floats, Mask] = (np.empty((0, *size), np.float32), np.empty((0, *size), np.bool_))
+        self.best: Floats = np.full(size, unrelated, np.float32)
+        self.second: Floats = np.full(size, unrelated, np.float32)
+        self.place: Floats = np.full(size, -1, np.float32)
 
-    def push(self, cost: Tensor, seen: Tensor) -> None:
-        """Take the next plane's cost (h, w) and where enough neighbours see it."""
-        self.before.append((cost, seen))
-        self.count += 1
-        if len(self.before) < 3:
-            return
-        (previous, had_seen), (middle, usable), (following, will_see) = self.before
-        self.before.pop(0)
+    def push(self, costs: Tensor, seen: Tensor) -> None:
+        """Take the next planes' costs (d, h, w), and where enough neighbours see them."""
+        planes = np.concatenate((self.before[0], costs.numpy(force=True)))
+        sees = np.concatenate((self.before[1], seen.numpy(force=True)))
+        first = self.count - len(self.before[0])
+        height = len(self.best)
+        bands = min(torch.get_num_threads(), height)
+
+        def band(number: int) -> None:
+            rows = slice(number * height // bands, (number + 1) * height // bands)
+            for middle in range(1, len(planes) - 1):
+                self._visit(
+                    first + middle, planes[middle - 1 : middle + 2, rows], sees[middle - 1 : middle + 2, rows], rows
+                )
+
+        on_threads(band, range(bands))
+        self.count += len(costs)
+        self.before = (planes[-2:].copy(), sees[-2:].copy())
+
+    def _visit(self, index: int, costs: Floats, seen: Mask, rows: slice) -> None:
+        """Take the minima of one plane, between its neighbours (3, h, w), in some rows."""
+        best, second, place = (values[rows].reshape(-1) for values in (self.best, self.second, self.place))
+        previous, middle, following = costs.reshape(3, -1)
+        is_minimum = middle < second
+        is_minimum &= middle <= previous
+        is_minimum &= middle < following
+        is_minimum &= seen[1].reshape(-1)
         # Few pixels have a minimum here that counts; all else is done for these alone.
-        counts = usable & (middle <= previous) & (middle < following) & (middle < torch.maximum(self.best, self.second))
-        at = counts.flatten().nonzero()[:, 0]
-        if len(at) == 0:
-            return
-        before, cost, after, best, second, winner = (
-            values.flatten()[at] for values in (previous, middle, following, self.best, self.second, self.place)
-        )
+        at = np.flatnonzero(is_minimum)
+        cost, lowest, winner = middle[at], best[at], place[at]
         # Beside what nobody sees there is no curve to follow.
-        has_sides = (had_seen & will_see).flatten()[at]
-        place = self.count - 2 + torch.where(has_sides, self._offset(before, cost, after), 0.0)
-        elsewhere = (place - winner > self.apart) | (winner < 0)
-        better = cost < best
+        has_sides = (seen[0] & seen[2]).reshape(-1)[at]
+        found = index + np.where(has_sides, self._offset(index, previous[at], cost, following[at]), 0)
+        elsewhere = (found - winner > self.apart) | (winner < 0)
+        better = cost < lowest
         # A better minimum beside the old one replaces it; elsewhere it demotes the old one.
-        loser = torch.where(better, best, cost).clamp_max(self.unrelated)
-        demoted = torch.where(better, loser, torch.minimum(loser, second))
-        self.second.view(-1)[at] = torch.where(elsewhere, demoted, second)
-        self.best.view(-1)[at] = torch.where(better, cost, best)
-        self.place.view(-1)[at] = torch.where(better, place, winner)
+        second[at] = np.where(elsewhere, np.where(better, lowest, cost), second[at])
+        best[at] = np.where(better, cost, lowest)
+        place[at] = np.where(better, found, winner)
 
-    def _offset(self, before: Tensor, cost: Tensor, after: Tensor) -> Tensor:
+    def _offset(self, index: int, before: Floats, cost: Floats, after: Floats) -> Floats:
         """Where the parabola through three planes has its vertex, in planes from the middle one, in [-0.5, 0.5]."""
-        first, middle, last = self.inverse[self.count - 3 : self.count]
+        first, middle, last = self.inverse[index - 1 : index + 2]
         step, next_step = first - middle, middle - last
         # Its derivative by inverse depth is, half way between two planes, their slope; it is 0 at the vertex.
         slope, next_slope = (cost - before) / step, (after - cost) / next_step
-        vertex = -0.5 * (slope * next_step + next_slope * step) / (next_slope - slope).clamp_min(1e-30)
-        return torch.where(vertex > 0, vertex / next_step, vertex / step)
+        vertex = -0.5 * (slope * next_step + next_slope * step) / np.maximum(next_slope - slope, 1e-30)
+        return np.where(vertex > 0, vertex / next_step, vertex / step).astype(np.float32)
 
     def depth(self) -> Tensor:
         """Depth of the winners (h, w) float32, linear in inverse depth between planes; 0 where there is none."""
-        inverse = torch.tensor(self.inverse, dtype=torch.float64, device=self.place.device)
-        lower = self.place.clamp(0, len(inverse) - 2).floor().long()
-        depth = 1 / torch.lerp(inverse[lower], inverse[lower + 1], (self.place - lower).double())
-        return torch.where(self.place >= 0, depth, 0.0).float()
+        inverse = np.interp(self.place, np.arange(len(self.inverse)), self.inverse)
+        return torch.from_numpy(np.where(self.place >= 0, 1 / inverse, 0).astype(np.float32))
 
     def uniqueness(self) -> Tensor:
         """By how much the second-lowest minimum elsewhere is above the lowest, in [0, 1], (h, w)."""
-        return ((self.second - self.best) / self.second.clamp_min(1e-3)).clamp(0, 1)
+        return torch.from_numpy(((self.second - self.best) / np.maximum(self.second, 1e-3)).clip(0, 1))

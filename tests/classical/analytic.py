@@ -13,8 +13,8 @@ from tests.oracle import hit_box, hit_plane, hit_sphere, look_at
 
 SIZE = (72, 96)
 NEAR, FAR = 1.2, 3.6
-# The surfaces are about two units before the cameras, which are the reference and three around it.
-EYES = ((0.0, 0.0, -2.0), (0.32, 0.04, -2.0), (-0.28, 0.11, -1.95), (0.08, -0.3, -2.05))
+# The surfaces are about two units before the cameras, which are the reference and four around it.
+EYES = ((0.0, 0.0, -2.0), (0.32, 0.04, -2.0), (-0.28, 0.11, -1.95), (0.08, -0.3, -2.05), (-0.04, 0.3, -2.0))
 # The box is turned: a little, and so that a corner is ahead.
 BOX, CORNER = (0.15, -0.1, -1.0), (0.7, -0.5, -1.0)
 SURFACES = ("fronto-parallel", "slanted", "sphere", "box")
@@ -58,12 +58,19 @@ def hit(surface: str, origins: np.ndarray, directions: np.ndarray) -> np.ndarray
 
 
 def render(
-    surface: str, *, size: tuple[int, int] = SIZE, focal: float = 260.0, seed: int = 0, wavelength: float = 0.045
+    surface: str,
+    *,
+    views: int = 4,
+    size: tuple[int, int] = SIZE,
+    focal: float = 260.0,
+    seed: int = 0,
+    wavelength: float = 0.045,
 ) -> Pictures:
     """Trace one surface from all cameras at the pixels' centres.
 
     Args:
-        surface: one of `SURFACES`.
+        surface: one of `SURFACES`, or "corner".
+        views: V, 5 at most.
         size: (h, w).
         focal: pixels.
         seed: of the texture.
@@ -74,7 +81,7 @@ def render(
     K = np.array([[focal, 0.0, width / 2 - 1.3], [0.0, 1.03 * focal, height / 2 + 0.4], [0.0, 0.0, 1.0]])
     rays = np.stack((u, v, np.ones_like(u)), -1) @ np.linalg.inv(K).T  # camera z = 1, so that s is depth
     images, extrinsics, depths = [], [], []
-    for eye in np.array(EYES):
+    for eye in np.array(EYES[:views]):
         rotation, translation = look_at(eye, np.zeros(3), np.array([0.0, -1.0, 0.0]))
         directions = (rays @ rotation).reshape(-1, 3)
         depth = hit(surface, np.broadcast_to(eye, directions.shape), directions)
@@ -90,5 +97,4 @@ def render(
     for y in range(2 * BORDER + 1):
         for x in range(2 * BORDER + 1):
             inner &= padded[y : y + height, x : x + width]
-    number = len(EYES)
-    return Pictures(np.stack(images), np.stack([K] * number), np.stack(extrinsics), depths[0], inner)
+    return Pictures(np.stack(images), np.stack([K] * views), np.stack(extrinsics), depths[0], inner)

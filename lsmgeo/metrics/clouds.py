@@ -6,9 +6,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_number, describe
+from lsmgeo._checks import check_float, check_number, describe, moved
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
 
 __all__ = ["CloudScores", "point_cloud_scores"]
@@ -60,20 +61,27 @@ def point_cloud_scores(
     from scipy.spatial import cKDTree
 
     who = "point_cloud_scores"
-    for name, value in (("threshold", threshold), ("cell", cell)):
-        if value is not None and not check_number(who, name, value, "above 0") > 0:
-            raise OptionError(f"{who}: {name} must be above 0; got {value}")
+    limit = _positive(who, "threshold", threshold)
+    side = None if cell is None else _positive(who, "cell", cell)
     clouds = [_as_points(who, name, value) for name, value in (("predicted", predicted), ("true", true))]
-    p, t = clouds if cell is None else [_averaged(points, cell) for points in clouds]
+    p, t = clouds if side is None else [_averaged(points, side) for points in clouds]
     to_true = cKDTree(t).query(p)[0] if len(t) and len(p) else np.full(len(p), np.inf)
     to_predicted = cKDTree(p).query(t)[0] if len(t) and len(p) else np.full(len(t), np.inf)
-    precision, recall = (_mean(distances < threshold) for distances in (to_true, to_predicted))
+    precision, recall = (_mean(distances < limit) for distances in (to_true, to_predicted))
     return CloudScores(_mean(to_true), _mean(to_predicted), precision, recall, _harmonic_mean(precision, recall))
+
+
+def _positive(who: str, name: str, value: float) -> float:
+    number = check_number(who, name, value, "above 0")
+    if not number > 0:
+        raise OptionError(f"{who}: {name} must be above 0; got {value}")
+    return number
 
 
 def _as_points(who: str, name: str, value: Tensor | np.ndarray) -> np.ndarray:
     if isinstance(value, Tensor):
-        value = value.detach().cpu().double().numpy()
+        check_float(who, name, value, "(N, 3)", rank=2)
+        value = moved(who, name, value.detach(), torch.device("cpu")).double().numpy()
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
         raise DTypeError(f"{who}: {name} must be a tensor or an array of numbers (N, 3); got {describe(value)}")
     if value.ndim != 2 or value.shape[1] != 3:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_choice, check_devices, check_float, check_mask, check_number
-from lsmgeo.errors import OptionError, ShapeError
+from lsmgeo._checks import check_choice, check_devices, check_float, check_mask, check_number, describe
+from lsmgeo.errors import DTypeError, OptionError, ShapeError
 from lsmgeo.metrics.depth import middle_of_lowest
 
 __all__ = ["DensityCurve", "RunningDensityCurve", "density_curve"]
@@ -71,8 +71,8 @@ def density_curve(
         tensor([0.1000, 0.1500, 0.2333, nan], dtype=torch.float64)
     """
     who = "density_curve"
-    wanted = _check_options(who, densities, statistic, threshold)
-    return _curve(*_taken(who, errors, confidence, mask), wanted, statistic, threshold)
+    wanted, limit = _check_options(who, densities, statistic, threshold)
+    return _curve(*_taken(who, errors, confidence, mask), wanted, statistic, limit)
 
 
 class RunningDensityCurve:
@@ -100,8 +100,8 @@ class RunningDensityCurve:
     """
 
     def __init__(self, densities: Sequence[float], *, statistic: str = "median", threshold: float | None = None):
-        self.densities = _check_options("RunningDensityCurve", densities, statistic, threshold)
-        self.statistic, self.threshold = statistic, threshold
+        self.densities, self.threshold = _check_options("RunningDensityCurve", densities, statistic, threshold)
+        self.statistic = statistic
         self._parts: list[tuple[Tensor, Tensor]] = []
 
     def update(self, errors: Tensor, confidence: Tensor, mask: Tensor | None = None) -> None:
@@ -127,16 +127,25 @@ class RunningDensityCurve:
         return _curve(errors, confidence, self.densities, self.statistic, self.threshold)
 
 
-def _check_options(who: str, densities: Sequence[float], statistic: str, threshold: float | None) -> tuple[float, ...]:
-    wanted = tuple(check_number(who, "densities", density, "numbers in (0, 1]") for density in densities)
+def _check_options(
+    who: str, densities: Sequence[float], statistic: str, threshold: float | None
+) -> tuple[tuple[float, ...], float | None]:
+    """The densities and the threshold as Python's numbers."""
+    expected = "numbers in (0, 1]"
+    if isinstance(densities, Tensor) or not isinstance(densities, Iterable):
+        raise DTypeError(f"{who}: densities must be {expected}; got {describe(densities)}")
+    wanted = tuple(check_number(who, "densities", density, expected) for density in densities)
     if not all(0 < density <= 1 for density in wanted):
-        raise OptionError(f"{who}: densities must lie in (0, 1]; got {wanted}")
+        raise OptionError(f"{who}: densities must be {expected}; got {wanted}")
     check_choice(who, "statistic", statistic, STATISTICS)
     if (statistic == "bad") != (threshold is not None):
-        raise OptionError(f"{who}: threshold goes with statistic='bad'; got {threshold} with {statistic!r}")
-    if threshold is not None and check_number(who, "threshold", threshold, "at least 0") < 0:
+        raise OptionError(f"{who}: threshold goes with statistic='bad'; got {describe(threshold)} with {statistic!r}")
+    if threshold is None:
+        return wanted, None
+    limit = check_number(who, "threshold", threshold, "at least 0")
+    if limit < 0:
         raise OptionError(f"{who}: threshold must be at least 0; got {threshold}")
-    return wanted
+    return wanted, limit
 
 
 def _taken(who: str, errors: Tensor, confidence: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -150,8 +159,9 @@ def _taken(who: str, errors: Tensor, confidence: Tensor, mask: Tensor | None) ->
         )
     if mask is not None:
         check_mask(who, "mask", mask, tuple(errors.shape), "of the shape of errors")
-        errors, confidence = errors[mask], confidence[mask]
     check_devices(who, errors=errors, confidence=confidence, mask=mask)
+    if mask is not None:
+        errors, confidence = errors[mask], confidence[mask]
     return errors.double().flatten().nan_to_num(torch.inf, torch.inf), confidence.double().flatten().nan_to_num(0.0)
 
 

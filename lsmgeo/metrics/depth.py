@@ -156,7 +156,7 @@ def median_depth_error(
     radius: float = RADIUS,
     rule: str = "paper",
 ) -> MedianDepthError:
-    """Measure depth maps as Kar et al. 2017 (section 4, "Comparison with plane sweeping") do.
+    """Measure depth maps as Kar et al. 2017 (section 4, "Comparison to Plane Sweeping") do.
 
     Equation: ``median |p - d|`` over the pixels that count; of an even number the mean of the two in the middle. A
     prediction that is NaN has an infinite error.
@@ -200,14 +200,15 @@ def median_depth_error(
     """
     who = "median_depth_error"
     middle = check_number(who, "center", center, "a number")
-    if not check_number(who, "radius", radius, "above 0") > 0:
+    reach = check_number(who, "radius", radius, "above 0")
+    if not reach > 0:
         raise OptionError(f"{who}: radius must be above 0; got {radius}")
     check_choice(who, "rule", rule, ("paper", "release"))
     p, d, _, counts = _compared(who, "depth", predicted, depth, mask)
     if rule == "paper":
-        counts = counts & ((d - middle).abs() <= radius)
+        counts = counts & ((d - middle).abs() <= reach)
     else:
-        counts = counts & (p > middle - radius) & (p < middle + radius)
+        counts = counts & (p > middle - reach) & (p < middle + reach)
     errors = torch.where(counts, (p - d).abs().nan_to_num(torch.inf, torch.inf), torch.inf).flatten(-2)
     return MedianDepthError(middle_of_lowest(errors, counts.flatten(-2).sum(-1)), counts.sum((-2, -1)))
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_number, describe
+from lsmgeo._checks import check_float, check_number, describe, moved
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
 from lsmgeo.metrics.depth import RADIUS, median_depth_error
 from lsmgeo.metrics.voxels import voxel_iou
@@ -220,10 +220,20 @@ def _check_rank(who: str, name: str, value: Any, rank: int, expected: str) -> No
 def _collect(
     who: str, collected: dict[str, list[float]], values: Tensor | Sequence[float], categories: Sequence[str] | str
 ) -> None:
-    numbers = torch.as_tensor(values, dtype=torch.float64).tolist()
+    if isinstance(categories, Tensor) or not isinstance(categories, Iterable):
+        raise DTypeError(f"{who}: categories must be names; got {describe(categories)}")
+    if not isinstance(values, Tensor):
+        try:
+            values = torch.tensor(values, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError, OverflowError):
+            raise DTypeError(f"{who}: values must be numbers, one a model; got {describe(values)}") from None
+    elif not values.is_complex() and values.layout == torch.strided:
+        values = values.double()  # counts of pixels are whole numbers
+    check_float(who, "values", values, "(B,), one a model", rank=1)
+    numbers = moved(who, "values", values, torch.device("cpu")).tolist()
     names = [categories] * len(numbers) if isinstance(categories, str) else list(categories)
     if len(names) != len(numbers):
-        raise ShapeError(f"{who}: categories must be {len(numbers)} names, one a model; got {len(names)}")
+        raise ShapeError(f"{who}: categories must be as many names as values, {len(numbers)}; got {len(names)}")
     if strange := [name for name in names if not isinstance(name, str)]:
         raise DTypeError(f"{who}: categories must be names; got {describe(strange[0])}")
     for name, number in zip(names, numbers, strict=True):

@@ -145,11 +145,11 @@ def test_errors_name_the_argument():
     predicted, truth, _ = random_models(2)
     with pytest.raises(ShapeError, match=r"VoxelIoU.update: predicted must be \(B, D, H, W\)"):
         VoxelIoU().update(predicted[0], truth[0])
-    with pytest.raises(ShapeError, match=r"VoxelIoU.update: categories must be 2 names"):
+    with pytest.raises(ShapeError, match=r"VoxelIoU.update: categories must be as many names as values, 2; got 1"):
         VoxelIoU().update(predicted, truth, ["car"])
     with pytest.raises(ShapeError, match=r"DepthError.update: predicted must be \(B, V, h, w\)"):
         DepthError().update(torch.ones(2, 3, 4), torch.ones(2, 3, 4))
-    with pytest.raises(ShapeError, match=r"category_means: categories must be 2 names"):
+    with pytest.raises(ShapeError, match=r"category_means: categories must be as many names as values, 2; got 1"):
         category_means([0.1, 0.2], ["car"])
     with pytest.raises(DTypeError, match=r"VoxelIoU.update: categories must be names; got NoneType None"):
         VoxelIoU().update(predicted, truth, ["car", None])

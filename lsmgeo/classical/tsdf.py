@@ -22,7 +22,7 @@ __all__ = ["Tsdf", "fuse_depth", "voxel_side"]
 # Voxels on each side of a surface that hear of it by default.
 TRUNCATION = 3.0
 # Numbers alive for every voxel of a slab at the worst moment (measured).
-LIVE = 24
+LIVE = 42
 
 
 class Tsdf(NamedTuple):
@@ -65,7 +65,8 @@ def fuse_depth(
         depths: (V, h, w), or any iterable of V maps (h, w) of any sizes, read one at a time; float32 or float64.
         cameras: V cameras.
         grid: where to fuse; of one scene, any shape and pose.
-        truncation: world units; by default 3 times the longest side of a voxel.
+        truncation: world units; by default 3 times the longest side of a voxel. Noise of depth should stay below it,
+            and what is seen only at a grazing angle needs more: behind it, rays cross few voxels before the truncation.
         colours: (V, 3, h, w) RGB in [0, 1], or an iterable of V, of the depth maps' sizes and dtype.
         weights: (V, h, w) not negative, or an iterable of V: confidence that multiplies the weight of every pixel.
         background: (V, h, w) bool, or an iterable of V: pixels of which it is known that their rays hit nothing. All
@@ -146,9 +147,12 @@ class _Sums:
         self.near = torch.zeros_like(self.distance) if coloured else None
 
     def finish(self) -> Tsdf:
-        self.distance /= torch.where(self.weight > 0, self.weight, 1)
+        # Plane by plane, so that no second volume is held.
+        for plane, weight in enumerate(self.weight):
+            self.distance[plane] /= torch.where(weight > 0, weight, 1)
         if self.colours is not None and self.near is not None:
-            self.colours /= torch.where(self.near > 0, self.near, 1)
+            for plane, near in enumerate(self.near):
+                self.colours[:, plane] /= torch.where(near > 0, near, 1)
         return Tsdf(self.distance, self.weight, self.colours)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+
 import numpy as np
 import pytest
 import torch
@@ -260,6 +262,25 @@ def test_slabs_and_order_of_views_change_nothing():
     turned = CameraTensors(*(value.flip(0) for value in tensors[:2]), *cameras.size)
     for first, second in zip(whole, fuse_depth(depth.flip(0), turned, grid, colours=colours.flip(0)), strict=True):
         torch.testing.assert_close(second, first, rtol=1e-5, atol=1e-6)
+
+
+def test_maps_are_let_go_one_after_another():
+    cameras, grid = all_round(6, (12, 12)), VoxelGrid(4)
+    alive: list[weakref.ref[torch.Tensor]] = []
+    most = 0
+
+    def maps():
+        nonlocal most
+        for _ in range(6):
+            most = max(most, sum(item() is not None for item in alive))
+            one = torch.full((12, 12), 2.0)
+            alive.append(weakref.ref(one))
+            yield one
+            del one
+
+    fuse_depth(maps(), cameras.tensors(), grid)
+    assert len(alive) == 6
+    assert most <= 2  # the one at hand, and the next
 
 
 def test_moving_grid_and_cameras_together_changes_nothing():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lsmgeo import VoxelGrid
@@ -106,6 +106,7 @@ def test_a_concavity_is_never_seen():
     assert hull[inside].all()
 
 
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), views=st.integers(2, 6), outside=st.sampled_from(["empty", "unknown"]))
 def test_more_views_add_nothing_by_strict_intersection(seed, views, outside):
     generator = np.random.default_rng(seed)

@@ -103,7 +103,8 @@ def sweep(
 
     Returns:
         `DepthMap` at (h, w). The confidence is ``max(0, 1 - cost)`` times the root of the uniqueness (how far the
-        second-lowest minimum elsewhere is above the lowest) times the fraction of near pixels whose planes agree.
+        second-lowest minimum elsewhere is above the lowest) times the fraction of near pixels that lie at the
+        same place, within two pixels of the neighbour where samples move most.
 
     Raises:
         OptionError: too few planes or views, or a memory bound too small for one plane.
@@ -136,7 +137,7 @@ def sweep(
                 winners.push(cost, seen)
                 bar.update(len(cost))
         cost, place = torch.from_numpy(winners.best), torch.from_numpy(winners.place)
-        confidence = (1 - cost).clamp(0, 1) * winners.uniqueness().sqrt() * _agreement(place)
+        confidence = (1 - cost).clamp(0, 1) * winners.uniqueness().sqrt() * _agreement(place, winners.apart)
         confidence = torch.where(place >= 0, confidence, 0.0)
         return DepthMap(*(values.to(images.device) for values in (winners.depth(), confidence, cost, place)))
 
@@ -193,9 +194,9 @@ def _without_specks(mask: Tensor, planes: Tensor, least: int) -> Tensor:
     return mask & torch.from_numpy(labels > 0)
 
 
-def _agreement(place: Tensor, radius: int = 2) -> Tensor:
-    """The fraction of the pixels around each whose winner lies within two planes of its own, (h, w)."""
+def _agreement(place: Tensor, apart: float, radius: int = 2) -> Tensor:
+    """The fraction of the pixels around each whose winner is at most so many planes apart from its own, (h, w)."""
     height, width = place.shape
     side = 2 * radius + 1
     around = unfold(pad(place[None, None], (radius,) * 4, value=-1e6), side)[0].reshape(side * side, height, width)
-    return (((around - place).abs() <= 2).float().sum(0) - 1) / (side * side - 1)
+    return (((around - place).abs() <= apart).float().sum(0) - 1) / (side * side - 1)

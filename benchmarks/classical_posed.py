@@ -15,16 +15,17 @@ from lsmgeo.classical import Reconstruction, reconstruct_scene
 
 SETS = {"fountain": "strecha_fountain_quarter", "temple": "middlebury_temple", "COLMAP scene": "colmap_scene"}
 DENSITY, MOST_ERROR = 0.4, 0.005
-# So many views next to each other are swept, and agreement is asked of these alone.
-VIEWS = 6
+# So many views next to each other are swept, and agreement is asked of these alone; features are matched among more.
+VIEWS, VIEWS_MATCHED = 3, 12
 
 
-def triangulated_of(scene: data.PosedImages, views: list[int]) -> list[Depths]:
-    """The depths of views' features, in the photographs' own size."""
-    pictures = (np.rint(255 * luminance(scene.load(view))).astype(np.uint8) for view in range(len(scene)))
+def triangulated_of(scene: data.PosedImages, views: list[int], among: list[int] | None = None) -> list[Depths]:
+    """The depths of views' features, in the photographs' own size, from matches among some views or all."""
+    among = list(range(len(scene))) if among is None else among
+    pictures = (np.rint(255 * luminance(scene.load(view))).astype(np.uint8) for view in among)
     features = [find_features(picture) for picture in pictures]
-    K, E = (value.double().numpy() for value in scene.cameras[:2])
-    return [triangulate(features, K, E, view) for view in views]
+    K, E = (value[among].double().numpy() for value in scene.cameras[:2])
+    return [triangulate(features, K, E, among.index(view)) for view in views]
 
 
 def sparse_of(scene: data.PosedImages, view: int) -> Depths | None:
@@ -60,7 +61,7 @@ def measure(root: Path, size: int = 640, names: tuple[str, ...] = tuple(SETS)) -
         scene = data.open(root / SETS[name])
         views = list(range(min(VIEWS, len(scene))))
         judged = reconstruct_scene(scene, views, size=size, mesh=False, density=1.0, progress=True).views
-        truths = {"triangulated features": triangulated_of(scene, views)}
+        truths = {"triangulated features": triangulated_of(scene, views, list(range(min(VIEWS_MATCHED, len(scene)))))}
         if scene.points is not None:
             truths["the set's sparse points"] = [sparse_of(scene, view) for view in views]  # type: ignore[misc]
         for kind, depths in truths.items():

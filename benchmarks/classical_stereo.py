@@ -41,7 +41,7 @@ def disparity_of(depth: np.ndarray) -> np.ndarray:
     return np.where(known, FOCAL_LENGTH * BASELINE / np.where(known, depth, 1.0) - OFFSET, np.nan)
 
 
-def found(root: Path, planes: int = 300) -> tuple[dict[str, Found], np.ndarray, float]:
+def found(root: Path, planes: int = 300, *, unfiltered: bool = True) -> tuple[dict[str, Found], np.ndarray, float]:
     """Disparities of all methods, the true ones, and the fraction of our pixels that both directions agree on.
 
     OpenCV's matchers say only whether they trust a pixel: their curves have a single point.
@@ -62,7 +62,7 @@ def found(root: Path, planes: int = 300) -> tuple[dict[str, Found], np.ndarray, 
                 filtered=filtered,
                 mesh=False,
             ).views[0]
-            for name, filtered in (("ours, filtered", True), ("ours, unfiltered", False))
+            for name, filtered in (("ours, filtered", True), ("ours, unfiltered", False))[: 1 + unfiltered]
         }
         plain = plain_sweep([luminance(image) for image in images], scene.cameras, depth_of(np.arange(FIRST, LAST + 1)))
     pair = [(image.permute(1, 2, 0) * 255).round().byte().numpy() for image in images]
@@ -81,7 +81,7 @@ def found(root: Path, planes: int = 300) -> tuple[dict[str, Found], np.ndarray, 
 def curve(method: Found, true: np.ndarray) -> tuple[list[float], list[float]]:
     """Densities, of all pixels, and the fraction of wrong pixels at each; one density where confidence has no order."""
     most = float(np.isfinite(method.value).mean())
-    levels = [density for density in DENSITIES if density <= most] + [most]
+    levels = [density for density in DENSITIES if density < most] + [most]
     if len(np.unique(method.confidence)) <= 2:
         levels = [most]
     return levels, [bad_at(method, true, density, THRESHOLD) for density in levels]
@@ -102,7 +102,7 @@ def measure(root: Path) -> tuple[list[Row], dict[str, Any]]:
     table = []
     for name in methods:
         for density, bad in zip(curves[name]["density"], curves[name]["bad"], strict=True):
-            if len(curves[name]["density"]) == 1 or density in (0.4, 0.7, 0.9, 1.0):
+            if density in (0.4, 0.7, curves[name]["density"][-1]):
                 table.append(
                     Row(SECTION, f"bad-2 at {100 * density:.0f} % density, {name}", f"{100 * bad:.1f} %", "", None)
                 )

@@ -199,7 +199,7 @@ def reconstruct_scene(
         filtered: see `reconstruct_view`.
         density: see `reconstruct_view`; a bound, as pixels must find agreement besides.
         min_views: see `reconstruct_view`.
-        min_support: least number of other swept views that must agree; by default 2, or as many as were swept besides.
+        min_support: least number of other swept views that must agree; by default 1, where others are swept.
         mesh: whether to make the surface.
         resolution: voxels along the longest side of the box in which the surface is made.
         memory: bound in bytes on what one sweep adds to the process; depth maps and pictures of all views are kept.
@@ -222,7 +222,7 @@ def reconstruct_scene(
         sweeper.check_view(view)
     check_whole("reconstruct_scene", "resolution", resolution, 8)
     if min_support is None:
-        min_support = min(2, len(chosen) - 1)
+        min_support = min(1, len(chosen) - 1)
     min_support = check_whole("reconstruct_scene", "min_support", min_support, 0, len(chosen) - 1)
     with tqdm(chosen, desc="sweep", unit="view", disable=None if progress else True) as bar:
         alone = [sweeper.reconstruct(view) for view in bar]

@@ -25,7 +25,7 @@ def read(scene, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(read):
-    return reconstruct_scene(read, resolution=48, **OPTIONS)
+    return reconstruct_scene(read, resolution=48, min_support=2, **OPTIONS)
 
 
 def test_pixels_kept_lie_where_the_scene_does(scene, whole):

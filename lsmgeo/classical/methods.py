@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 __all__ = ["hull_results", "readable", "sweep_results"]
 
 MOST_NAMED = 5
+# Kept pixels below this fraction are worth a word.
+FEW = 0.05
 
 
 def readable(scene: PosedImages) -> tuple[PosedImages, tuple[str, ...]]:
@@ -95,6 +97,13 @@ def sweep_results(
             "No pixel was kept: nowhere do the photographs match with any certainty. They may lack texture, be too "
             "far apart, or have wrong cameras (lsmgeo info tells), or the true depth lies outside near and far.",
         )
+    pixels, whole = sum(int(one.mask.sum()) for one in views), sum(one.mask.numel() for one in views)
+    if 0 < pixels < FEW * whole:
+        other = ". They are cut out: --method hull is the other way" if scene.cut_out else ""
+        notes += (
+            f"Only {100 * pixels / whole:.1f} % of the pixels were kept: the photographs may be few, far apart or "
+            f"without texture, or their cameras wrong (lsmgeo info tells){other}.",
+        )
     facts = [("scene", f"{len(scene)} photographs, {scene.source}")]
     first = views[0]
     if view is not None:
@@ -106,7 +115,6 @@ def sweep_results(
     low, high = min(float(one.depths[0]) for one in views), max(float(one.depths[-1]) for one in views)
     facts.append(("sweep", f"{width} x {height} pixels, {len(first.depths)} planes from {low:.4g} to {high:.4g}"))
     facts.append(("memory", f"at most {options['memory'] >> 20} MiB a sweep beyond the libraries and the photographs"))
-    pixels, whole = sum(int(one.mask.sum()) for one in views), sum(one.mask.numel() for one in views)
     facts.append(("kept", f"{pixels} pixels, {100 * pixels / whole:.1f} %"))
     errors = [one.error for one in views if one.error is not None and one.error.points]
     if errors:

@@ -31,15 +31,6 @@ from benchmarks.classical_rows import Row
 SECTIONS = ("analytic", "stereo", "rgbd", "posed", "hull", "tsdf", "speed")
 
 
-def lines(rows: list[Row]) -> report.Rows:
-    """The figures as a table."""
-    said = {True: "reached", False: "MISSED", None: ""}
-    return [
-        ["of", "figure", "measured", "goal", ""],
-        *([row.section, row.what, row.measured, row.goal, said[row.reached]] for row in rows),
-    ]
-
-
 def measure(section: str, root: Path | None) -> tuple[list[Row], dict[str, Any]]:
     """The rows of a section, and the numbers that its curves are drawn from, where it has any."""
     module = importlib.import_module(f"benchmarks.classical_{section}")
@@ -58,31 +49,27 @@ def main(arguments: list[str] | None = None) -> int:
     root = options.data if options.data is not None and options.data.is_dir() else None
     if root is None:
         print("no folder of sets: --data, or LSMGEO_TEST_DATA, names none; figures that need it are left out")
-    path = timing.RESULTS / "classical.json"
-    sections = (options.only,) if options.only else SECTIONS
-    kept = (
-        {case["section"]: case for case in json.loads(path.read_text(encoding="utf-8"))["cases"]}
-        if options.only and path.is_file()
-        else {}
-    )
     rows: list[Row] = []
-    for section in sections:
+    measured: dict[str, dict[str, Any]] = {}
+    for section in (options.only,) if options.only else SECTIONS:
         start = time.perf_counter()
         found, figures = measure(section, root)
         rows += found
-        kept[section] = {
+        measured[section] = {
             "section": section,
             "seconds": time.perf_counter() - start,
             "rows": [row._asdict() for row in found],
             **figures,
         }
-    report.show(lines(rows))
+    report.show(report.reached_rows(list(measured.values())))
     missed = [row for row in rows if row.reached is False]
     print(f"{sum(row.reached is True for row in rows)} figures reached, {len(missed)} missed")
     if root is not None:
-        order = [kept[section] for section in SECTIONS if section in kept]
+        path = timing.RESULTS / "classical.json"
+        kept = json.loads(path.read_text(encoding="utf-8"))["cases"] if options.only and path.is_file() else []
+        cases = {**{case["section"]: case for case in kept}, **measured}
         device = "cuda" if torch.cuda.is_available() else "cpu"
-        print(timing.save("classical", timing.machine(device), order))
+        print(timing.save("classical", timing.machine(device), [cases[name] for name in SECTIONS if name in cases]))
     return int(bool(missed))
 
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from benchmarks import classical_posed, classical_rgbd, classical_stereo
-from benchmarks.classical_baselines import Found, bad_at, median_at, winners
+from benchmarks.classical_baselines import bad_at, winners
 from lsmgeo import data
 from lsmgeo.classical import reconstruct_scene
 
 ROOT = os.environ.get("LSMGEO_TEST_DATA")
-real = pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of real photographs")
+pytestmark = pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of real photographs")
 
 
 def folder(name):
@@ -25,7 +25,6 @@ def folder(name):
     return path.parent
 
 
-@real
 def test_the_motorcycle_is_swept_better_than_by_the_plainest_sweep():
     methods, true, agreed = classical_stereo.found(folder("middlebury_motorcycle"), planes=61, unfiltered=False)
     ours, plain, rival = (methods[name] for name in ("ours, filtered", "plain ZNCC", "StereoSGBM"))
@@ -37,14 +36,12 @@ def test_the_motorcycle_is_swept_better_than_by_the_plainest_sweep():
     assert mine <= 1.5 * theirs
 
 
-@real
 def test_depth_of_a_room_is_twice_as_good_as_the_plainest_sweeps():
     found = classical_rgbd.errors(folder("hololens_rgbd"), [21])
     assert found["ours"].shape == (1, 3)
     assert (found["ours"] <= 0.5 * found["plain ZNCC"]).all()
 
 
-@real
 @pytest.mark.parametrize("name", [pytest.param("fountain", marks=pytest.mark.long), "temple", "COLMAP scene"])
 def test_depth_agrees_with_triangulated_features(name):
     scene = data.open(folder(classical_posed.SETS[name]) / classical_posed.SETS[name])
@@ -58,14 +55,3 @@ def test_depth_agrees_with_triangulated_features(name):
     errors = classical_posed.errors_at(swept, truth, scene.size(1), 0.4)
     assert len(errors) > 50
     assert np.median(errors) < 0.005
-
-
-def test_densities_are_of_all_pixels_in_the_order_of_confidence():
-    value = np.array([[1.0, 2.0, np.nan, 4.0], [5.0, 6.0, 7.0, 8.0]])
-    confidence = np.array([[0.9, 0.1, 1.0, 0.8], [0.7, 0.6, 0.5, 0.4]])
-    found = Found(value, confidence)
-    np.testing.assert_array_equal(winners(found, 0.25), [[True, False, False, True], [False] * 4])
-    assert int(winners(found, 1.0).sum()) == 7
-    true = np.array([[1.0, 5.0, 3.0, np.nan], [5.0, 9.0, 7.0, 8.0]])
-    assert bad_at(found, true, 0.5, 2.0) == pytest.approx(1 / 3)
-    assert median_at(found, true, 0.375) == 0.0

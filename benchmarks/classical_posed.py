@@ -16,7 +16,9 @@ from lsmgeo.classical import Reconstruction, reconstruct_scene
 SETS = {"fountain": "strecha_fountain_quarter", "temple": "middlebury_temple", "COLMAP scene": "colmap_scene"}
 DENSITY, MOST_ERROR = 0.4, 0.005
 # So many views next to each other are swept, and agreement is asked of these alone; features are matched among more.
-VIEWS, VIEWS_MATCHED = 3, 12
+VIEWS, VIEWS_MATCHED = 3, 8
+# Longer side of the depth maps, pixels.
+SIZE = 480
 
 
 def triangulated_of(scene: data.PosedImages, views: list[int], among: list[int] | None = None) -> list[Depths]:
@@ -53,7 +55,7 @@ def rows(root: Path | None) -> list[Row]:
     return [] if root is None else measure(root)[0]
 
 
-def measure(root: Path, size: int = 640, names: tuple[str, ...] = tuple(SETS)) -> tuple[list[Row], dict[str, Any]]:
+def measure(root: Path, size: int = SIZE, names: tuple[str, ...] = tuple(SETS)) -> tuple[list[Row], dict[str, Any]]:
     """The rows, and every view's figures."""
     table: list[Row] = []
     figures: dict[str, Any] = {}

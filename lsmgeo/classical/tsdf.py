@@ -214,13 +214,14 @@ def _feature_maps(maps: _Maps, camera: CameraTensors, truncation: float) -> tupl
     depth = maps.depth
     has_depth = depth > 0
     inverse = _without_cracks(torch.where(has_depth, 1 / torch.where(has_depth, depth, 1), 0), truncation)
-    rough = _is_rough(inverse, truncation)
-    weight = _cosine(inverse, camera)
+    inner = None
     if maps.background is not None:
         # The largest of the negative is the least: a rim of one pixel is no background.
         inner = -max_pool2d(-maps.background[None, None].to(depth.dtype), 3, 1, 1)[0, 0] > 0
-        inverse, weight = torch.where(inner, 0, inverse), torch.where(inner, 1, weight)
-        rough |= inner
+        inverse = torch.where(inner, 0, inverse)
+    rough, weight = _is_rough(inverse, truncation), _cosine(inverse, camera)
+    if inner is not None:
+        weight = torch.where(inner, 1, weight)
     if maps.weights is not None:
         weight = weight * maps.weights
     smooth = torch.stack((inverse, rough.to(depth.dtype)))

@@ -233,6 +233,9 @@ def test_cracks_are_closed_and_holes_are_not():
     empty[:, :, 15:18] = True  # the rim of background is left out
     fused = fuse_depth(flat, camera, column, background=empty, truncation=0.05)
     torch.testing.assert_close(fused.distance, torch.full((9, 1, 1), 0.05))
+    # Background counts even where there is depth.
+    fused = fuse_depth(torch.full((1, 32, 32), 2.0), camera, column, background=empty, truncation=0.05)
+    torch.testing.assert_close(fused.distance, torch.full((9, 1, 1), 0.05))
 
 
 def test_colours_are_those_of_the_surface():

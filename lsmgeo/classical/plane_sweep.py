@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad, unfold
+from torch.nn.functional import pad
 from tqdm import tqdm
 
 from lsmgeo._checks import check_float, check_whole
@@ -25,10 +25,10 @@ __all__ = ["DepthMap", "kept", "slab_planes", "sweep"]
 SAME_PIXELS = 2.0
 # More planes at once are not faster.
 MOST_PLANES = 8
-# How many arrays of each kind are alive at once at the worst moment, and what the libraries take besides.
+# How many arrays of each kind are alive at once at the worst moment (measured), and what the libraries take besides.
 LIVE_COSTS = 8
-LIVE_IMAGES = 40
-OVERHEAD = 128 << 20
+LIVE_IMAGES = 24
+OVERHEAD = 48 << 20
 
 
 class DepthMap(NamedTuple):
@@ -45,7 +45,7 @@ def slab_planes(neighbours: int, channels: int, size: tuple[int, int], memory: i
 
     Args:
         neighbours: V - 1.
-        channels: C of what is warped.
+        channels: C of what is warped, in numbers of 4 bytes.
         size: (h, w) of the maps.
         memory: bytes that the sweep may add to the process.
 
@@ -53,8 +53,9 @@ def slab_planes(neighbours: int, channels: int, size: tuple[int, int], memory: i
         OptionError: not even one plane fits.
     """
     image = 4 * size[0] * size[1]
-    fixed = OVERHEAD + ((neighbours + 1) * (channels + 1) + LIVE_IMAGES) * image
-    plane = (2 * channels + LIVE_COSTS) * neighbours * image
+    rooms = torch.get_num_threads() * (neighbours + 4)
+    fixed = OVERHEAD + ((neighbours + 1) * (channels + 1) + rooms + LIVE_IMAGES) * image
+    plane = (3 * channels + LIVE_COSTS) * neighbours * image
     if memory < fixed + plane:
         need = -(-(fixed + plane) // 2**20)
         raise OptionError(
@@ -117,7 +118,8 @@ def sweep(
         raise OptionError(f"sweep: depths must hold at least 3 planes; got {depths.shape[0]}")
     neighbours = max(views - 1, 1)
     min_views = check_whole("sweep", "min_views", min_views, 1, neighbours)
-    slab = slab_planes(neighbours, channels if score in ("sad", "cosine") else 1, (height, width), memory)
+    warped = (channels if score in ("sad", "cosine") else 1) * max(1, images.element_size() // 4)
+    slab = slab_planes(neighbours, warped, (height, width), memory)
     with torch.no_grad():
         winners = Winners(depths, (height, width), UNRELATED, _planes_apart(cameras, depths, (height, width)))
         with tqdm(total=len(depths), desc="sweep", unit="plane", disable=None if progress else True) as bar:
@@ -198,5 +200,9 @@ def _agreement(place: Tensor, apart: float, radius: int = 2) -> Tensor:
     """The fraction of the pixels around each whose winner is at most so many planes apart from its own, (h, w)."""
     height, width = place.shape
     side = 2 * radius + 1
-    around = unfold(pad(place[None, None], (radius,) * 4, value=-1e6), side)[0].reshape(side * side, height, width)
-    return (((around - place).abs() <= apart).float().sum(0) - 1) / (side * side - 1)
+    around = pad(place[None], (radius,) * 4, value=-1e6)[0]
+    count = torch.zeros(place.shape, dtype=torch.uint8)
+    for y in range(side):
+        for x in range(side):
+            count += (around[y : y + height, x : x + width] - place).abs_() <= apart
+    return (count.float() - 1) / (side * side - 1)

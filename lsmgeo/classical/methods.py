@@ -59,7 +59,7 @@ def readable(scene: PosedImages) -> tuple[PosedImages, tuple[str, ...]]:
         lenses=None if scene.lenses is None else tuple(scene.lenses[view] for view in kept),
         depths=None if scene.depths is None else tuple(scene.depths[view] for view in kept),
     )
-    return fewer, (f"{len(reasons)} photographs are left out, as they cannot be read: {_some(reasons)}",)
+    return fewer, (f"Left out, as it cannot be read: {_some(reasons)}",)
 
 
 def sweep_results(
@@ -110,7 +110,8 @@ def sweep_results(
         matched = ", ".join(scene.names[other] for other in first.neighbours)
         facts.append(("view", f"{view} ({scene.names[view]}), matched with {matched}"))
     else:
-        facts.append(("views", f"{len(views)} of {len(scene)} swept, checked against each other and fused"))
+        together = ", checked against each other and fused" if len(views) > 1 else ""
+        facts.append(("views", f"{len(views)} of {len(scene)} swept{together}"))
     height, width = first.mask.shape
     low, high = min(float(one.depths[0]) for one in views), max(float(one.depths[-1]) for one in views)
     facts.append(("sweep", f"{width} x {height} pixels, {len(first.depths)} planes from {low:.4g} to {high:.4g}"))
@@ -224,7 +225,7 @@ def _able(scene: PosedImages, options: dict[str, Any]) -> tuple[list[int], tuple
     if not reasons:
         return able, ()
     words = _some([f"{scene.names[view]}: {error}" for view, error in reasons])
-    return able, (f"{len(reasons)} views are not swept: {words}",)
+    return able, (f"Not swept: {words}",)
 
 
 def _of_mesh(mesh: SurfaceMesh | None) -> list[tuple[str, str]]:

@@ -191,7 +191,7 @@ def test_a_damaged_photograph_is_left_out_and_named(scene, tmp_path, capsys):
     arguments = ["reconstruct", str(folder), "--planes", "64", "--out", str(out), "--resolution", "32"]
     assert cli.main(arguments) == 0
     said = capsys.readouterr().err
-    assert "warning: 1 photographs are left out" in said
+    assert "warning: Left out, as it cannot be read" in said
     assert "v1.png" in said
     depths, entries = read_results(out)
     assert [entry["photograph"] for entry in entries] == ["v0.png", "v2.png", "v4.png", "view_3.png"]

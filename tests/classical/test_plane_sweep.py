@@ -172,24 +172,22 @@ def test_a_sweep_is_its_parts():
 def test_threads_and_slabs_change_nothing():
     pictures = analytic.render("box")
     _, expected = swept(pictures, 24)
-    least = next(size << 20 for size in range(1, 1024) if _fits(size << 20))
-    for threads, memory in ((1, least), (2, least), (3, 1 << 30)):
+    for threads, memory in ((1, None), (2, None), (3, 1 << 30)):
         before = torch.get_num_threads()
         torch.set_num_threads(threads)
         try:
-            _, found = swept(pictures, 24, memory=memory)
+            _, found = swept(pictures, 24, memory=memory or least_memory(analytic.SIZE))
         finally:
             torch.set_num_threads(before)
         for one, other in zip(found, expected, strict=True):
             torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
-def _fits(memory: int) -> bool:
-    try:
-        slab_planes(3, 1, analytic.SIZE, memory)
-    except OptionError:
-        return False
-    return True
+def least_memory(size: tuple[int, int]) -> int:
+    """Bytes without which not even one plane fits, in whole MiB; it depends on the number of threads."""
+    with pytest.raises(OptionError) as error:
+        slab_planes(3, 1, size, 0)
+    return int(str(error.value).split(" MiB")[0].split()[-1]) << 20
 
 
 def test_what_nobody_sees_has_no_depth():
@@ -247,38 +245,30 @@ def _status(key: str) -> int:
     return int(next(line for line in lines if line.startswith(key)).split()[1]) * 1024
 
 
-def _measure(connection: Any, size: tuple[int, int], memory: int) -> None:
+def _measure(connection: Any, size: tuple[int, int]) -> None:
     torch.set_num_threads(2)
+    memory = least_memory(size)
     pictures = analytic.render("slanted", size=size)
     swept(pictures, 10, memory=memory)  # what libraries take once
     before = _status("VmRSS")
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     swept(pictures, 40, memory=memory)
-    connection.send(_status("VmHWM") - before)
+    connection.send((_status("VmHWM") - before, memory))
 
 
 @pytest.mark.skipif(not os.access("/proc/self/clear_refs", os.W_OK), reason="this system tells no peak")
 def test_a_sweep_stays_within_its_memory():
     size = (160, 200)
-    least = next(memory << 20 for memory in range(1, 1024) if _can_hold(size, memory << 20))
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_measure, args=(sender, size, least))
+    process = context.Process(target=_measure, args=(sender, size))
     process.start()
     sender.close()
-    added = receiver.recv()
+    added, bound = receiver.recv()
     process.join()
     volume = 4 * 40 * 3 * size[0] * size[1]
-    assert 0 < added < least
+    assert 0 < added < bound
     assert added < volume  # of all neighbours' costs
-
-
-def _can_hold(size: tuple[int, int], memory: int) -> bool:
-    try:
-        slab_planes(3, 1, size, memory)
-    except OptionError:
-        return False
-    return True
 
 
 # Planes

@@ -18,6 +18,7 @@ from lsmgeo.classical.consistency import consistent_views
 from lsmgeo.classical.filtering import guided_filter
 from lsmgeo.classical.plane_sweep import DepthMap, kept, sweep
 from lsmgeo.classical.planes import MOST_PLANES, sweep_planes
+from lsmgeo.classical.sparse import SparseError, sparse_error
 from lsmgeo.classical.views import camera_centers, default_depth_range, select_neighbours
 from lsmgeo.data import PosedImages
 from lsmgeo.errors import OptionError
@@ -29,11 +30,9 @@ if TYPE_CHECKING:
 __all__ = [
     "Reconstruction",
     "SceneReconstruction",
-    "SparseError",
     "points_of",
     "reconstruct_scene",
     "reconstruct_view",
-    "sparse_error",
 ]
 
 # Confidence below which a pixel is never shown, however few there are: a winner without agreement around it.
@@ -44,15 +43,6 @@ NOISE = 0.5 / 255
 SPECK_FACES = 100
 # With so many other depth maps, the nearest views', a depth map is compared at most.
 MOST_CHECKED = 12
-
-
-@dataclass(frozen=True)
-class SparseError:
-    """Relative depth error at a scene's own sparse points."""
-
-    median: float
-    points: int
-    observed: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +129,7 @@ def reconstruct_view(
         best: how many neighbours are averaged at a site, see `lsmgeo.classical.aggregate_views`.
         filtered: whether costs are averaged along the edges of the photograph, see `lsmgeo.classical.guided_filter`.
         density: largest fraction of the pixels to keep.
-        min_views: least number of neighbours that must see a point; by default 2, or 1 where there is only one.
+        min_views: least number of neighbours that must see a point; by default 2; never more than there are.
         memory: bound in bytes on what the sweep adds to the process.
         progress: whether to show a progress bar.
 
@@ -294,7 +284,7 @@ class _Sweeper:
             score=self.score,
             window=self.window,
             best=None if self.best is None else min(self.best, len(chosen)),
-            min_views=min(2, len(chosen)) if self.min_views is None else self.min_views,
+            min_views=min(2 if self.min_views is None else self.min_views, len(chosen)),
             cost_filter=guided_filter(images[0]) if self.filtered else None,
             noise=NOISE,
             memory=self.memory,
@@ -378,34 +368,6 @@ def points_of(depth: Tensor, camera: CameraTensors) -> Tensor:
     origin, directions = rays(camera, (depth.shape[0], depth.shape[1]))
     forward = camera.cam_from_world[2, :3]
     return origin + directions * (depth.double() / (directions * forward).sum(-1))[..., None]
-
-
-def sparse_error(scene: PosedImages, view: int, depth_map: DepthMap, mask: Tensor) -> SparseError | None:
-    """Median relative depth error at the sparse points that a view observes, among the pixels of a mask.
-
-    Args:
-        scene: with or without sparse points.
-        view: the view of the depth map.
-        depth_map: its depths, of any size.
-        mask: (h, w) bool, the pixels that count.
-
-    Returns:
-        The median of ``|depth - true| / true``, and how many points count of how many observed; None without points.
-    """
-    if scene.points is None:
-        return None
-    observed = scene.points.observations[view]
-    E = scene.cameras.cam_from_world[view].double().numpy()
-    expected = scene.points.positions[observed.points] @ E[2, :3] + E[2, 3]
-    height, width = depth_map.depth.shape
-    full = scene.size(view)
-    scale = np.array([width / full[1], height / full[0]])
-    cells = np.floor((observed.pixels + 0.5) * scale).astype(np.int64)
-    inside = ((cells >= 0) & (cells < (width, height))).all(1) & (expected > 0)
-    x, y = cells[inside].T
-    use = mask.numpy()[y, x]
-    errors = np.abs(depth_map.depth.numpy()[y, x] - expected[inside])[use] / expected[inside][use]
-    return SparseError(float(np.median(errors)) if len(errors) else float("nan"), len(errors), len(expected))
 
 
 def _working_size(scene: PosedImages, view: int, size: int) -> tuple[int, int]:

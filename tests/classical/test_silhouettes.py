@@ -88,6 +88,15 @@ def test_a_folder_may_be_named_and_names_may_have_two_endings(tmp_path):
     check(silhouettes(scene, folder=str(tmp_path / "elsewhere")))
 
 
+def test_a_transparent_pixel_of_a_mask_is_off_the_object(tmp_path):
+    scene = photographs(tmp_path / "images", on_colour(0))
+    (tmp_path / "masks").mkdir()
+    for view in range(3):
+        alpha = np.where(disc(view), 255, 0).astype(np.uint8)
+        Image.fromarray(np.dstack((np.full((*SIZE, 3), 255, np.uint8), alpha))).save(tmp_path / "masks" / f"{view}.png")
+    check(silhouettes(scene))
+
+
 def test_a_folder_that_lacks_a_mask_is_not_taken_for_one(tmp_path):
     scene = photographs(tmp_path / "images", on_colour(0))
     write_masks(tmp_path / "images" / "masks", ["0.png", "1.png"])

@@ -35,8 +35,9 @@ __all__ = [
     "reconstruct_view",
 ]
 
-# Confidence below which a pixel is never shown, however few there are: a winner without agreement around it.
-LEAST_CONFIDENCE = 0.1
+# Confidence below which a pixel is never shown, however few there are: dark or plain surfaces give some depth, too.
+# What another view agrees with needs less.
+LEAST_CONFIDENCE, LEAST_CONFIDENCE_AGREED = 0.35, 0.1
 SPECK_FRACTION = 5e-4
 # Standard deviation of luminance that counts as no texture.
 NOISE = 0.5 / 255
@@ -324,7 +325,7 @@ class _Sweeper:
         most = min(len(others), 2)
         confidence = (support.clamp_max(most) + one.depth_map.confidence) / (most + 1)
         depth_map = one.depth_map._replace(confidence=torch.where(one.depth_map.depth > 0, confidence, 0.0))
-        allowed = (support >= least) & (one.depth_map.confidence > LEAST_CONFIDENCE)
+        allowed = (support >= least) & (one.depth_map.confidence > LEAST_CONFIDENCE_AGREED)
         return self._keep(replace(one, depth_map=depth_map, support=support), allowed)
 
     def _keep(self, one: Reconstruction, allowed: Tensor) -> Reconstruction:

@@ -98,6 +98,7 @@ def reconstruct(
     score: Literal["zncc", "sad", "census"] = "zncc",
     window: int = 5,
     density: float | None = None,
+    check: int = 2,
     resolution: int = 192,
     rule: Literal["all", "mean"] = "all",
     masks: str | None = None,
@@ -121,6 +122,8 @@ def reconstruct(
         score: for sweeps, how patches are compared.
         window: for sweeps, side of the patches in pixels.
         density: for sweeps, largest fraction of the pixels to keep; by default 0.4 of one view, 0.8 of all.
+        check: for the sweep of one view, how many of its neighbours are swept too; they must agree with it. 0 takes a
+            third of the time.
         resolution: voxels along the longest side of the box in which the mesh is made.
         rule: for hulls, whether a voxel must lie in "all" silhouettes, or in three quarters of them ("mean"), which
             forgives wrong ones.
@@ -180,6 +183,7 @@ def reconstruct(
             images,
             reference,
             f"{Path(scene).resolve().name}, plane sweep{seen}",
+            check=check,
             resolution=resolution,
             density=density,
             neighbours=neighbours,

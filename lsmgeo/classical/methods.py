@@ -23,6 +23,7 @@ __all__ = ["hull_results", "readable", "sweep_results"]
 MOST_NAMED = 5
 # Kept pixels below this fraction are worth a word.
 FEW = 0.05
+DENSITY_OF_ONE = 0.4
 
 
 def readable(scene: PosedImages) -> tuple[PosedImages, tuple[str, ...]]:
@@ -63,7 +64,14 @@ def readable(scene: PosedImages) -> tuple[PosedImages, tuple[str, ...]]:
 
 
 def sweep_results(
-    scene: PosedImages, view: int | None, title: str, *, resolution: int, density: float | None, **options: Any
+    scene: PosedImages,
+    view: int | None,
+    title: str,
+    *,
+    check: int,
+    resolution: int,
+    density: float | None,
+    **options: Any,
 ) -> Results:
     """Plane-sweep stereo of one view, or of all that can be swept.
 
@@ -71,6 +79,7 @@ def sweep_results(
         scene: posed photographs.
         view: the one to sweep; None for all.
         title: of what is written.
+        check: how many neighbours of one view are swept too, all of which must agree with it.
         resolution: voxels along the longest side of the mesh's box.
         density: largest fraction of the pixels to keep; None for the method's own.
         options: of `lsmgeo.classical.reconstruct_view`.
@@ -85,7 +94,7 @@ def sweep_results(
     mesh: SurfaceMesh | None = None
     views: tuple[Reconstruction, ...]
     if view is not None:
-        one = reconstruct_view(scene, view, progress=True, **options)
+        one = _checked_view(scene, view, check, {"density": DENSITY_OF_ONE} | options)
         views, points, colours = (one,), one.points, one.colours
         mesh = surface_of(views, points, resolution) if len(points) else None
     else:
@@ -203,8 +212,23 @@ def _some(reasons: list[str]) -> str:
     return "; ".join(reasons[:MOST_NAMED]) + more
 
 
-def _able(scene: PosedImages, options: dict[str, Any]) -> tuple[list[int], tuple[str, ...]]:
-    """The views that have a depth range and neighbours, and a note on the others."""
+def _checked_view(scene: PosedImages, view: int, check: int, options: dict[str, Any]) -> Reconstruction:
+    """One view, with the pixels kept with which its best neighbours agree that can be swept themselves."""
+    if check < 0:
+        raise OptionError(f"check must be 0 or more; got {check}")
+    if check == 0 or len(scene) < 2:
+        return reconstruct_view(scene, view, progress=True, **options)
+    able, _ = _able(scene, options, only=view)
+    near, far = options.get("near"), options.get("far")
+    others = [other for other in select_neighbours(scene, view, check, near=near, far=far) if other in able]
+    if not others:
+        return reconstruct_view(scene, view, progress=True, **options)
+    swept = reconstruct_scene(scene, [view, *others], min_support=len(others), mesh=False, progress=True, **options)
+    return swept.views[0]
+
+
+def _able(scene: PosedImages, options: dict[str, Any], *, only: int | None = None) -> tuple[list[int], tuple[str, ...]]:
+    """The views that have a depth range and neighbours, and a note on the others; one may have to be among them."""
     able, reasons = [], []
     stated = [value for value in (options.get("near"), options.get("far")) if value is not None]
     if not all(0 < value < float("inf") for value in stated):
@@ -217,6 +241,8 @@ def _able(scene: PosedImages, options: dict[str, Any]) -> tuple[list[int], tuple
                 near, far = lower if near is None else near, upper if far is None else far
             select_neighbours(scene, view, options["neighbours"], near=near, far=far)
         except OptionError as error:
+            if view == only:
+                raise
             reasons.append((view, error))
         else:
             able.append(view)

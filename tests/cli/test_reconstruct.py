@@ -272,6 +272,7 @@ def _fits(memory):
         (["--far", ".inf"], "near and far must be positive"),
         (["--memory", "1"], "memory must be at least"),
         (["--memory", "-5"], "memory must be at least"),
+        (["--view", "0", "--check=-1"], "check must be 0 or more; got -1"),
     ],
 )
 def test_wrong_options_give_one_line_and_status_2(folder, tmp_path, capsys, arguments, message):

@@ -50,7 +50,8 @@ def test_a_sweep_of_photographs_is_right_to_a_thousandth_and_knows_where(run):
     names = run("plane_sweep_stereo")
     assert float(names["relative"].median()) < 1e-3
     rates = names["curve"].error
-    assert float(rates[:7].max()) < 0.01 < float(rates[8])
+    assert float(rates[:3].max()) < 1e-3
+    assert float((names["relative"] > 0.02).float().mean()) > 0.01
     # The camera that cannot see the place disagrees at its depth, and the better half does not mind.
     place = (int((names["planes"] - names["truth"][names["row"], names["column"]]).abs().argmin()), 60, 115)
     assert float(names["costs"][1][place]) > 1

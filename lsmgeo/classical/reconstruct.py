@@ -110,7 +110,7 @@ def reconstruct_view(
     best: int | None = None,
     filtered: bool = True,
     density: float = 0.4,
-    min_views: int | None = None,
+    min_views: int = 1,
     memory: int = 1 << 30,
     progress: bool = False,
 ) -> Reconstruction:
@@ -130,7 +130,7 @@ def reconstruct_view(
         best: how many neighbours are averaged at a site, see `lsmgeo.classical.aggregate_views`.
         filtered: whether costs are averaged along the edges of the photograph, see `lsmgeo.classical.guided_filter`.
         density: largest fraction of the pixels to keep.
-        min_views: least number of neighbours that must see a point; by default 2; never more than there are.
+        min_views: least number of neighbours that must see a point; never more than there are.
         memory: bound in bytes on what the sweep adds to the process.
         progress: whether to show a progress bar.
 
@@ -163,7 +163,7 @@ def reconstruct_scene(
     best: int | None = None,
     filtered: bool = True,
     density: float = 0.8,
-    min_views: int | None = None,
+    min_views: int = 1,
     min_support: int | None = None,
     mesh: bool = True,
     resolution: int = 192,
@@ -240,7 +240,7 @@ class _Sweeper:
     best: int | None
     filtered: bool
     density: float
-    min_views: int | None
+    min_views: int
     memory: int
 
     def __post_init__(self) -> None:
@@ -285,7 +285,7 @@ class _Sweeper:
             score=self.score,
             window=self.window,
             best=None if self.best is None else min(self.best, len(chosen)),
-            min_views=min(2 if self.min_views is None else self.min_views, len(chosen)),
+            min_views=min(self.min_views, len(chosen)),
             cost_filter=guided_filter(images[0]) if self.filtered else None,
             noise=NOISE,
             memory=self.memory,

@@ -36,6 +36,7 @@ def test_the_motorcycle_is_swept_better_than_by_the_plainest_sweep():
     assert mine <= 1.5 * theirs
 
 
+@pytest.mark.long
 def test_depth_of_a_room_is_twice_as_good_as_the_plainest_sweeps():
     found = classical_rgbd.errors(folder("hololens_rgbd"), [21])
     assert found["ours"].shape == (1, 3)

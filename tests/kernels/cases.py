@@ -83,6 +83,7 @@ CASES: dict[str, Callable[[str], None]] = {
     "one channel": _case(unproject_call, FEATURES[:, :, :1], VIEWS, frustum((2, 70))),
     "one channel, border": _case(unproject_call, FEATURES[:, :, :1], VIEWS, frustum((2, 70)), padding_mode="border"),
     "one channel, nearest": _case(unproject_call, FEATURES[:, :, :1], VIEWS, GRID, mode="nearest", view_mask=MASK),
+    "no channel but the depth": _case(unproject_call, FEATURES[:, :, :0], VIEWS, GRID, augment=("depth",)),
     "near": _case(unproject_call, FEATURES, VIEWS, GRID, near=1.6, padding_mode="border"),
     "mean": _case(unproject_call, WIDE, VIEWS, GRID, reduce="mean"),
     "variance": _case(unproject_call, WIDE, VIEWS, GRID, reduce="variance", padding_mode="border"),

@@ -169,6 +169,8 @@ void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_
     const S *source = source_of<S>(call, scene, view);
     const int64_t channels = plan.channels;
     const Plain image = plain(call, axes);
+    // One of an image: without any, the only one may be geometry.
+    const bool one_channel = DIMS == 2 && call.channels == 1 && channels == 1 && image.fits;
     for (int64_t number = first; number < last; number++) {
         start(plan, tile, scene, view, number);
         const Layout at = layout(call.values_stride, tile);
@@ -181,7 +183,7 @@ void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_
         const bool direct = call.values_type == FLOAT32 && at.channel == 1;
         float *out = direct ? static_cast<float *>(call.values) + at.base : room.values;
         const int64_t step = direct ? at.site : channels;
-        if (DIMS == 2 && channels == 1 && step == 1 && image.fits && gather_row(call, tile, source, image, out)) {
+        if (one_channel && step == 1 && gather_row(call, tile, source, image, out)) {
             if (!direct) put(call, at, tile.number, channels, room.values);
             continue;
         }

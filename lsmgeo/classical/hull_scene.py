@@ -156,21 +156,23 @@ def hull_depth(occupancy: Tensor, grid: VoxelGrid, camera: CameraTensors) -> Ten
     world = torch.cartesian_prod(*ends.unbind(1)) @ T[:3, :3].T + T[:3, 3]
     corners = world @ E[:3, :3].T + E[:3, 3]
     z = corners[:, 2]
-    step = voxel_side(grid) / PLANES_PER_VOXEL
-    nearest = float(z.min())
+    # Of the shortest side, so that flat voxels are not stepped over.
+    step = float(T[:3, :3].norm(dim=0).min()) / PLANES_PER_VOXEL
+    nearest, farthest = float(z.min()), float(z.max())
+    start = max(nearest, step) + step / 2
     top, left, bottom, right = 0, 0, height, width
     if nearest > step:
         pixels = corners @ camera.intrinsics.double().T
         pixels = pixels[:, :2] / pixels[:, 2:]
         (x0, y0), (x1, y1) = pixels.amin(0).floor().long().tolist(), pixels.amax(0).ceil().long().tolist()
         top, left, bottom, right = max(0, y0), max(0, x0), min(height, y1 + 1), min(width, x1 + 1)
-    if top >= bottom or left >= right or float(z.max()) <= 0:
+    if top >= bottom or left >= right or farthest <= start:
         return depth
     window = crop(stack([camera]), top, left, bottom - top, right - left)
     size = bottom - top, right - left
     seen = depth[top:bottom, left:right]
     volume = occupancy[None, None].float()
-    planes = torch.arange(max(nearest, step) + step / 2, float(z.max()), step, dtype=torch.float64)
+    planes = torch.arange(start, farthest, step, dtype=torch.float64)
     for slab in planes.split(max(1, SITES // (size[0] * size[1]))):
         maps, _ = functional.plane_sweep_project(volume, window, grid, slab, size, mode="nearest")
         hit = maps[0, 0] > 0.5
@@ -199,7 +201,8 @@ def colour_vertices(mesh: SurfaceMesh, views: Sequence[HullView], behind: float)
     total, weight = torch.zeros(3, len(mesh.vertices)), torch.zeros(len(mesh.vertices))
     for view in views:
         cameras = stack([view.camera])
-        colours, _ = functional.unproject_points(view.image[None, None], cameras, points)
+        # By "zeros" the outer half pixel would fade to black.
+        colours, _ = functional.unproject_points(view.image[None, None], cameras, points, padding_mode="border")
         depth, visible = functional.unproject_points(
             view.depth[None, None, None], cameras, points, mode="nearest", augment=("depth",)
         )

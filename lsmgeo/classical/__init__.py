@@ -1,6 +1,7 @@
 """Reconstruction without learning, on the library's own operators."""
 
 from lsmgeo.classical.consistency import consistent_views
+from lsmgeo.classical.depth_range import find_depth_range
 from lsmgeo.classical.filtering import guided_filter
 from lsmgeo.classical.matching import MatchingCosts, aggregate_views, matching_costs, matching_costs_slabs
 from lsmgeo.classical.plane_sweep import DepthMap, kept, sweep
@@ -26,6 +27,7 @@ __all__ = [
     "default_grid",
     "drop_specks",
     "extract_mesh",
+    "find_depth_range",
     "fuse_depth",
     "guided_filter",
     "hull_box",

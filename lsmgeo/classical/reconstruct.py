@@ -9,17 +9,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 from tqdm import tqdm
 
 from lsmgeo._checks import check_whole
-from lsmgeo.cameras import CameraTensors, rays, resize, stack
+from lsmgeo.cameras import CameraTensors, rays, stack
 from lsmgeo.classical.consistency import consistent_views
+from lsmgeo.classical.depth_range import find_depth_range
 from lsmgeo.classical.filtering import guided_filter
+from lsmgeo.classical.gathering import gather
 from lsmgeo.classical.plane_sweep import DepthMap, kept, sweep
 from lsmgeo.classical.planes import MOST_PLANES, sweep_planes
 from lsmgeo.classical.sparse import SparseError, sparse_error
-from lsmgeo.classical.views import camera_centers, default_depth_range, select_neighbours
+from lsmgeo.classical.views import camera_centers, select_neighbours
 from lsmgeo.data import PosedImages
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid
@@ -123,7 +124,7 @@ def reconstruct_view(
         size: longer side of the depth map in pixels; never larger than the photograph.
         planes: number of depth planes; see `lsmgeo.classical.sweep_planes`.
         spacing: "inverse", "depth" or "disparity" (then their number follows).
-        near: nearest depth, world units; by default told from the scene, see `lsmgeo.classical.default_depth_range`.
+        near: nearest depth, world units; by default told from the scene, see `lsmgeo.classical.find_depth_range`.
         far: farthest depth.
         score: "zncc", "sad" or "census", see `lsmgeo.classical.matching_costs`.
         window: side of the patches in pixels, odd.
@@ -263,7 +264,7 @@ class _Sweeper:
     def depth_range(self, view: int) -> tuple[float, float]:
         near, far = self.near, self.far
         if near is None or far is None:
-            lower, upper = default_depth_range(self.scene, view)
+            lower, upper = find_depth_range(self.scene, view, noise=NOISE)
             near, far = near if near is not None else lower, far if far is not None else upper
         if not 0 < near < far < float("inf"):
             raise OptionError(f"near and far must be positive, finite and ascending; got {near} and {far}")
@@ -273,10 +274,7 @@ class _Sweeper:
         scene = self.scene
         near, far = self.depth_range(view)
         chosen = select_neighbours(scene, view, self.neighbours, near=near, far=far)
-        shape = _working_size(scene, view, self.size)
-        # All photographs take the reference's size; the resize rule keeps cameras exact, even where aspects differ.
-        images = torch.stack([_resized(scene.load(index), shape) for index in (view, *chosen)])
-        cameras = stack([resize(scene.camera(index), *shape) for index in (view, *chosen)])
+        images, cameras = gather(scene, (view, *chosen), self.size)
         depths = sweep_planes(cameras, near, far, self.planes, self.spacing)
         depth_map = sweep(
             images,
@@ -299,7 +297,7 @@ class _Sweeper:
             image=images[0].clone(),
             camera=camera,
             depth_map=depth_map,
-            mask=torch.zeros(shape, dtype=torch.bool),
+            mask=torch.zeros(images.shape[-2:], dtype=torch.bool),
             points=np.empty((0, 3), np.float32),
             colours=np.empty((0, 3), np.uint8),
             error=None,
@@ -369,15 +367,3 @@ def points_of(depth: Tensor, camera: CameraTensors) -> Tensor:
     origin, directions = rays(camera, (depth.shape[0], depth.shape[1]))
     forward = camera.cam_from_world[2, :3]
     return origin + directions * (depth.double() / (directions * forward).sum(-1))[..., None]
-
-
-def _working_size(scene: PosedImages, view: int, size: int) -> tuple[int, int]:
-    height, width = scene.size(view)
-    scale = min(1.0, size / max(height, width))
-    return max(1, round(height * scale)), max(1, round(width * scale))
-
-
-def _resized(image: Tensor, shape: tuple[int, int]) -> Tensor:
-    if tuple(image.shape[1:]) == shape:
-        return image
-    return interpolate(image[None], shape, mode="bilinear", antialias=True)[0].clamp(0, 1)

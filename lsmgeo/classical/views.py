@@ -12,7 +12,7 @@ from lsmgeo.data import PosedImages
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import FrustumGrid, depth_planes
 
-__all__ = ["camera_centers", "common_point", "default_depth_range", "select_neighbours"]
+__all__ = ["camera_centers", "common_point", "default_depth_range", "measured_depth_range", "select_neighbours"]
 
 # Below the first angle a pair says little about depth, above the last its patches hardly look alike any more.
 SMALLEST_ANGLE, BEST_ANGLE, LARGEST_ANGLE = 1.5, 10.0, 60.0
@@ -23,6 +23,8 @@ LEAST_SHARED_POINTS, LEAST_SHARED_FRUSTUM = 5, 0.2
 FRUSTUM_SHAPE = (6, 6, 8)
 # Fewer depths do not tell a range.
 LEAST_DEPTHS = 10
+# Of a picture's width: what moves more between two views cannot be matched, what moves less has no depth.
+LARGEST_DISPARITY, SMALLEST_DISPARITY = 0.3, 0.01
 
 
 def camera_centers(cameras: CameraTensors) -> np.ndarray:
@@ -124,20 +126,17 @@ def _is_seen(scene: PosedImages, view: int, points: np.ndarray) -> np.ndarray:
         return np.asarray(((pixels > -0.5) & (pixels < (width - 0.5, height - 0.5))).all(1))
 
 
-def default_depth_range(scene: PosedImages, view: int, neighbours: Sequence[int] | None = None) -> tuple[float, float]:
-    """Nearest and farthest depth to sweep in a view when nobody says.
-
-    From the sparse points that the view observes (their 2nd and 98th percentile, widened) where there are enough, or
-    from the depth that comes with the photograph, else around the point where the optical axes meet: what lies there
-    fills the pictures, so its size is about that of the field of view at that depth.
+def measured_depth_range(scene: PosedImages, view: int) -> tuple[float, float] | None:
+    """Nearest and farthest depth of the sparse points that a view observes, or of the depth that comes with it.
 
     Args:
         scene: the posed photographs.
         view: index of the view.
-        neighbours: the views whose optical axes count; by default all.
+
+    Returns:
+        Their 2nd and 98th percentile, widened, world units; None where there are too few.
 
     Raises:
-        OptionError: the depth cannot be told; ``near`` and ``far`` must be given.
         DataError: the depth that comes with the photograph cannot be read.
     """
     E = scene.cameras.cam_from_world[view].double().numpy()
@@ -148,20 +147,49 @@ def default_depth_range(scene: PosedImages, view: int, neighbours: Sequence[int]
     elif (measured := scene.load_depth(view)) is not None:
         depth = measured.double().flatten().numpy()
     depth = depth[depth > 0]
-    if len(depth) >= LEAST_DEPTHS:
-        low, high = np.percentile(depth, (2, 98))
-        margin = 0.25 * (high - low) + 0.02 * low
-        return float(max(low - margin, 0.5 * low)), float(high + margin)
-    looking = slice(None) if neighbours is None else [view, *neighbours]
+    if len(depth) < LEAST_DEPTHS:
+        return None
+    low, high = np.percentile(depth, (2, 98))
+    margin = 0.25 * (high - low) + 0.02 * low
+    return float(max(low - margin, 0.5 * low)), float(high + margin)
+
+
+def default_depth_range(scene: PosedImages, view: int, neighbours: Sequence[int] | None = None) -> tuple[float, float]:
+    """Nearest and farthest depth of what a view shows, as told by what was measured, or by the cameras.
+
+    Where there is no `measured_depth_range`, around the point where the optical axes meet: what lies there fills the
+    pictures, so its size is about that of the field of view at that depth. Where they meet nowhere, the depths at which
+    things move between this camera and the next by 1 to 30 % of the picture's width.
+
+    Args:
+        scene: the posed photographs.
+        view: index of the view.
+        neighbours: the views whose cameras count; by default all.
+
+    Raises:
+        OptionError: the depth cannot be told; ``near`` and ``far`` must be given.
+        DataError: the depth that comes with the photograph cannot be read.
+    """
+    measured = measured_depth_range(scene, view)
+    if measured is not None:
+        return measured
+    looking = list(range(len(scene))) if neighbours is None else [view, *neighbours]
     focus = common_point(CameraTensors(*(value[looking] for value in map(torch.as_tensor, scene.cameras))))
-    middle = float(E[2, :3] @ focus + E[2, 3])
-    if not middle > 0:
-        raise OptionError(f"view {view}: the cameras look at no common point; give near and far")
+    E = scene.cameras.cam_from_world[view].double().numpy()
     K = scene.cameras.intrinsics[view].double().numpy()
     height, width = scene.size(view)
-    radius = 0.75 * middle * min(0.5 * width / K[0, 0], 0.5 * height / K[1, 1])
-    radius = min(radius, 0.5 * middle)
-    return middle - radius, middle + radius
+    middle = float(E[2, :3] @ focus + E[2, 3])
+    centers = camera_centers(scene.cameras)
+    away = np.linalg.norm(centers[looking] - centers[view], axis=1)
+    # Parallel axes: rounding alone decides how far before or behind the cameras they meet.
+    if middle > 1e-6 * away.max():
+        radius = 0.75 * middle * float(min(0.5 * width / K[0, 0], 0.5 * height / K[1, 1]))
+        radius = min(radius, 0.5 * middle)
+        return middle - radius, middle + radius
+    if not away.any():
+        raise OptionError(f"view {view}: the cameras look at no common point; give near and far")
+    moved = float(K[0, 0]) * float(away[away > 0].min()) / width
+    return moved / LARGEST_DISPARITY, moved / SMALLEST_DISPARITY
 
 
 def _angles(first: np.ndarray, second: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ __all__ = ["find_depth_range"]
 SIZE, PLANES = 160, 160
 NEARER, FARTHER = 0.3, 4.0
 # The best pixels that are believed, how certain they must be, and the least fraction that says anything.
-DENSITY, CONFIDENCE, LEAST = 0.5, 0.2, 0.02
+DENSITY, CONFIDENCE, LEAST = 0.8, 0.3, 0.02
 MARGIN = 0.15
 
 

@@ -40,9 +40,11 @@ def common_point(cameras: CameraTensors) -> np.ndarray:
     """
     axes = cameras.cam_from_world[:, 2, :3].double().numpy()
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    right = np.einsum("vij,vj->i", projectors, camera_centers(cameras))
-    # Parallel axes meet nowhere; the pseudo-inverse then stays near the cameras instead of failing.
-    return np.linalg.pinv(projectors.sum(0), rcond=1e-6) @ right
+    centers = camera_centers(cameras)
+    middle = centers.mean(0)
+    right = np.einsum("vij,vj->i", projectors, centers - middle)
+    # Parallel axes meet nowhere; the pseudo-inverse then stays among the cameras instead of failing.
+    return np.asarray(middle + np.linalg.pinv(projectors.sum(0), rcond=1e-6) @ right)
 
 
 def select_neighbours(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -103,15 +102,13 @@ def cases() -> list[Case]:
     ]
 
 
-def reconstruct(solid: scenes.Solid, grid: VoxelGrid) -> tuple[SurfaceMesh, float]:
-    """The mesh fused from exact depth, and the seconds that fusing took."""
+def reconstruct(solid: scenes.Solid, grid: VoxelGrid) -> SurfaceMesh:
+    """The mesh fused from exact depth."""
     cameras = all_round()
     lights = scenes.Lights(torch.tensor([[1.0, 0.0, 0.0]]), torch.full((1, 3), 0.8), torch.full((3,), 0.2))
     pictures = scenes.render([scenes.Scene([solid])], cameras, lights)
-    start = time.perf_counter()
     fused = fuse_depth(pictures.depth[0], select(cameras, 0, 0), grid, colours=pictures.images[0])
-    seconds = time.perf_counter() - start
-    return extract_mesh(fused, grid), seconds
+    return extract_mesh(fused, grid)
 
 
 def sampled(mesh: SurfaceMesh) -> Array:
@@ -137,7 +134,7 @@ def rows(root: Path | None = None) -> list[Row]:
     found = []
     side = 1 / RESOLUTION
     for case in cases():
-        mesh, seconds = reconstruct(case.solid, VoxelGrid(RESOLUTION))
+        mesh = reconstruct(case.solid, VoxelGrid(RESOLUTION))
         points = sampled(mesh)
         accuracy = case.distance(points) / side
         # Of points of the true surface, to the nearest of the mesh's points: a little more than to the mesh.
@@ -157,8 +154,6 @@ def rows(root: Path | None = None) -> list[Row]:
         closed = is_closed(mesh)
         what = f"{case.name}: closed, {len(mesh.faces)} faces"
         found.append(Row("TSDF, exact depth", what, "yes" if closed else "no", "yes", closed))
-        speed = f"{1e9 * seconds / (VIEWS * RESOLUTION**3):.0f} ns a voxel and view ({seconds:.1f} s)"
-        found.append(Row("TSDF, exact depth", f"{case.name}: fusing, with colours", speed, "", None))
     return found
 
 

@@ -56,7 +56,7 @@ def visual_hull(
     """Carve a grid by silhouettes: what a voxel's centre meets in every view decides whether it stays.
 
     Equation: with ``s_v(X)`` the silhouette of view v interpolated where X projects, "mean" keeps
-    ``sum_v s_v / V > threshold`` (Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017, section 5: 0.75),
+    ``sum_v s_v / V > threshold`` (Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017, section 4: 0.75),
     and "all" ``min_v s_v > threshold`` (Laurentini, "The visual hull concept for silhouette-based image understanding",
     PAMI 1994). No silhouette shows a concavity: the hull fills it, whatever the number of views.
 

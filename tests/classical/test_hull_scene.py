@@ -42,7 +42,7 @@ def test_a_camera_within_a_hull_sees_what_lies_before_it(z):
 @pytest.mark.parametrize("x", [-0.4, 0.0, 7.0, 15.4])
 def test_vertices_take_the_colours_of_pictures_up_to_the_border(x):
     at = torch.linalg.inv(K) @ torch.tensor([x, 5.0, 1.0]) * 2
-    vertices = np.stack([at.numpy(), at.numpy() + [0.01, 0, 0], at.numpy() + [0, 0.01, 0]]).astype(np.float32)
+    vertices = (at.numpy() + 0.01 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])).astype(np.float32)
     mesh = SurfaceMesh(vertices, np.array([[0, 2, 1]]))
     picture = torch.tensor([1.0, 0.6, 0.2])[:, None, None].expand(3, 12, 16)
     view = HullView(0, picture, camera_at(0.0), torch.ones(12, 16) > 0, torch.full((12, 16), 2.0), 1.0)

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from lsmgeo import functional
-from lsmgeo.cameras import CameraTensors
+from lsmgeo._checks import check_float, check_number
+from lsmgeo.cameras import CameraTensors, resize
 from lsmgeo.errors import OptionError, ShapeError
 
 __all__ = ["consistent_views"]
@@ -31,13 +32,14 @@ def consistent_views(
     by interpolating inverse depth, which is exact on planes, and where one of the four has no depth, not at all.
 
     Convention:
-        Depth is camera z, 0 where there is none. Integer pixel centres.
+        Depth is camera z, 0 where there is none. Integer pixel centres; a depth map of another size than its camera's
+        image is resized for.
 
     Args:
         depth: (h, w) of the view that is checked.
-        camera: its camera, leading shape (), of images of that size.
+        camera: its camera, leading shape ().
         other_depths: (h', w') each, of any size.
-        other_cameras: their cameras, of images of their sizes.
+        other_cameras: their cameras, leading shape () each.
         pixels: largest distance of the pixel that comes back.
         relative: largest difference of the depth that comes back, as a fraction.
 
@@ -45,12 +47,12 @@ def consistent_views(
         (h, w) int64, from 0 to the number of other views; 0 where `depth` is. Not differentiable.
 
     Raises:
-        ShapeError: as many cameras as depth maps are needed, and each map must be (h, w).
+        ShapeError, DTypeError: as many cameras as depth maps are needed, and each map must be (h, w).
         OptionError: a tolerance that is not positive.
 
     Example:
         >>> import torch
-        >>> from lsmgeo.cameras import CameraTensors
+        >>> from lsmgeo.cameras import CameraTensors, resize
         >>> from lsmgeo.classical import consistent_views
         >>> K = torch.tensor([[4.0, 0.0, 1.5], [0.0, 4.0, 1.0], [0.0, 0.0, 1.0]])
         >>> E = torch.eye(4)
@@ -69,19 +71,20 @@ def consistent_views(
             f"got {len(other_cameras)}"
         )
     for name, value in (("depth", depth), *(("other_depths", other) for other in other_depths)):
-        if value.ndim != 2:
-            raise ShapeError(f"consistent_views: {name} must be (h, w); got {tuple(value.shape)}")
+        check_float("consistent_views", name, value, "(h, w)", rank=2)
     for name, number in (("pixels", pixels), ("relative", relative)):
-        if not number > 0:
+        if not check_number("consistent_views", name, number, "positive") > 0:
             raise OptionError(f"consistent_views: {name} must be positive; got {number}")
     height, width = depth.shape
+    camera = resize(camera, height, width)
     with torch.no_grad():
         y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         own = torch.stack((x, y), -1).reshape(-1, 2).double()
         start, known = depth.double().reshape(-1), depth.reshape(-1) > 0
         points = _points(camera, own, start)
         count = torch.zeros(height * width, dtype=torch.int64)
-        for other, seen_by in zip(other_depths, other_cameras, strict=True):
+        for other, other_camera in zip(other_depths, other_cameras, strict=True):
+            seen_by = resize(other_camera, *other.shape)
             place, z = _pixels(seen_by, points)
             found = _depth_at(other, place, z, known)
             back, distance = _pixels(camera, _points(seen_by, place, found))

@@ -116,6 +116,18 @@ def test_float32_maps_and_other_sizes_are_read(scene):
     assert float((found == 1).double().mean()) > 0.6
 
 
+def test_cameras_of_the_originals_give_what_resized_ones_give(scene):
+    from lsmgeo.cameras import resize
+
+    maps = [torch.from_numpy(scene.depth[view])[::2, ::2].contiguous() for view in (0, 1)]
+    originals = [camera_of(scene, view) for view in (0, 1)]
+    small = [resize(camera, *maps[0].shape) for camera in originals]
+    expected = consistent_views(maps[0], small[0], maps[1:], small[1:], pixels=0.5, relative=0.05)
+    found = consistent_views(maps[0], originals[0], maps[1:], originals[1:], pixels=0.5, relative=0.05)
+    assert 0 < int(expected.sum()) < expected.numel()
+    torch.testing.assert_close(found, expected, rtol=0, atol=0)
+
+
 def test_another_depth_does_not_agree(scene):
     maps = [torch.from_numpy(scene.depth[view]) for view in (0, 1)]
     cameras = [camera_of(scene, view) for view in (0, 1)]
@@ -138,5 +150,5 @@ def test_wrong_arguments_are_named(scene):
         consistent_views(depth[None], camera, [depth], [camera])
     with pytest.raises(OptionError, match="pixels must be positive; got 0"):
         consistent_views(depth, camera, [depth], [camera], pixels=0)
-    with pytest.raises(OptionError, match="relative must be positive; got nan"):
+    with pytest.raises(OptionError, match="relative must be positive; got float nan"):
         consistent_views(depth, camera, [depth], [camera], relative=float("nan"))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from lsmgeo._checks import check_whole
 from lsmgeo.classical.hull_scene import HullView, reconstruct_hull
 from lsmgeo.classical.outputs import Looked, Results
 from lsmgeo.classical.reconstruct import Reconstruction, reconstruct_scene, reconstruct_view, surface_of
@@ -24,6 +25,8 @@ MOST_NAMED = 5
 # Kept pixels below this fraction are worth a word.
 FEW = 0.05
 DENSITY_OF_ONE = 0.4
+# Along the longest side of the mesh's box.
+MOST_VOXELS = 1024
 
 
 def readable(scene: PosedImages) -> tuple[PosedImages, tuple[str, ...]]:
@@ -88,6 +91,7 @@ def sweep_results(
         OptionError: an option out of range, or no view can be swept.
         DataError: a photograph cannot be read.
     """
+    check_whole("reconstruct", "resolution", resolution, 8, MOST_VOXELS)
     if density is not None:
         options |= {"density": density}
     notes: tuple[str, ...] = ()
@@ -239,6 +243,9 @@ def _able(scene: PosedImages, options: dict[str, Any], *, only: int | None = Non
             if near is None or far is None:
                 lower, upper = default_depth_range(scene, view)
                 near, far = lower if near is None else near, upper if far is None else far
+                # One end alone may suit most views and lie beyond what another sees.
+                if not near < far:
+                    raise OptionError(f"near and far must be positive, finite and ascending; got {near} and {far}")
             select_neighbours(scene, view, options["neighbours"], near=near, far=far)
         except OptionError as error:
             if view == only:

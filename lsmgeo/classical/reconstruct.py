@@ -339,11 +339,13 @@ class _Sweeper:
 
 def surface_of(swept: Sequence[Reconstruction], points: np.ndarray, resolution: int) -> SurfaceMesh:
     """The surface that the kept pixels of several views show, in a box around the middle 98 % of their points."""
-    from lsmgeo.classical.surface import extract_mesh
+    from lsmgeo.classical.surface import SurfaceMesh, extract_mesh
     from lsmgeo.classical.tsdf import fuse_depth
 
     low, high = np.percentile(points.astype(np.float64), (1, 99), axis=0)
     margin = 0.1 * (high - low).max()
+    if not margin > 0:  # points at one place have no surface
+        return SurfaceMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
     low, high = low - margin, high + margin
     voxel = (high - low).max() / resolution
     shape = np.maximum(np.ceil((high - low) / voxel).astype(int), 2)

@@ -48,6 +48,12 @@ def test_points_and_surface_lie_on_the_plane(whole):
     assert np.median(np.abs(np.asarray(whole.mesh.vertices) @ NORMAL)) < 5e-3
 
 
+def test_points_at_one_place_have_no_surface():
+    from lsmgeo.classical.reconstruct import surface_of
+
+    assert len(surface_of([], np.ones((3, 3), np.float32), 16).faces) == 0
+
+
 def test_support_counts_the_views_that_agree(whole):
     for one in whole.views:
         assert one.support.shape == one.mask.shape

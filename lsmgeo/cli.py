@@ -136,6 +136,7 @@ def reconstruct(
     Returns:
         The exit status: 0, or 1 where nothing could be told.
     """
+    import os
     import time
     from pathlib import Path
 
@@ -161,6 +162,10 @@ def reconstruct(
         raise OptionError(f"view must lie in 0..{len(images) - 1}{named}; got {view!r}")
     if any(path.resolve().is_relative_to(Path(out).resolve()) for path in images.paths):
         raise OptionError(f"out must be a folder without the photographs, which it could replace; got {out!r}")
+    # Told before the work, not after.
+    there = next(str(path) for path in (Path(out).resolve(), *Path(out).resolve().parents) if os.path.exists(path))
+    if not os.path.isdir(there) or not os.access(there, os.W_OK | os.X_OK):
+        raise OptionError(f"out must be a folder that can be written or made; got {out!r}")
     images, left_out = readable(images)
     if name is not None and name not in images.names:
         raise OptionError(f"view must be a photograph that can be read: {left_out[0]}")

@@ -270,6 +270,9 @@ def _fits(memory):
         (["--near", "3", "--far", "1"], "near and far must be positive, finite and ascending; got 3.0 and 1.0"),
         (["--near", "-1"], "near and far must be positive"),
         (["--far", ".inf"], "near and far must be positive"),
+        (["--resolution", "0"], "resolution must be a whole number from 8 to 1024; got int 0"),
+        (["--view", "0", "--check", "0", "--resolution", "0"], "resolution must be a whole number from 8 to 1024"),
+        (["--resolution", "100000"], "resolution must be a whole number from 8 to 1024; got int 100000"),
         (["--memory", "1"], "memory must be at least"),
         (["--memory", "-5"], "memory must be at least"),
         (["--view", "0", "--check=-1"], "check must be 0 or more; got -1"),
@@ -304,6 +307,27 @@ def test_an_interrupt_leaves_no_file(scene, tmp_path, monkeypatch, capsys, place
     assert cli.main(["reconstruct", str(folder), "--planes", "8", "--out", str(out)]) == 130
     assert capsys.readouterr().err.endswith("lsmgeo: interrupted\n")
     assert list(out.rglob("*")) == []
+
+
+def test_a_place_that_cannot_be_written_is_told_before_the_work(folder, tmp_path, monkeypatch, capsys):
+    def work(*_, **__):
+        raise AssertionError
+
+    monkeypatch.setattr("lsmgeo.classical.reconstruct.sweep", work)
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file", tmp_path / "file" / "out"):
+        assert cli.main(["reconstruct", str(folder), "--out", str(out)]) == 2
+        assert f"out must be a folder that can be written or made; got '{out}'" in capsys.readouterr().err
+
+
+def test_views_of_which_one_end_of_the_range_leaves_nothing_are_left_out(scene, tmp_path, capsys):
+    folder = write_colmap(scene, tmp_path / "scene", form="binary")
+    ends = [default_depth_range(data.open(folder), view)[1] for view in range(5)]
+    near = (sorted(ends)[0] + sorted(ends)[1]) / 2
+    out = tmp_path / "out"
+    cli.main(["reconstruct", str(folder), "--near", str(near), "--planes", "8", "--size", "32", "--out", str(out)])
+    assert f"Not swept: {scene.names[int(np.argmin(ends))]}: near and far must be" in capsys.readouterr().err
+    assert len(list((out / "depth").iterdir())) == 4
 
 
 def test_a_missing_scene_gives_one_line_and_status_2(tmp_path, capsys):

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lsmgeo._checks import check_float, check_number, check_whole
 from lsmgeo.errors import OptionError, ShapeError
 
 __all__ = ["guided_filter"]
@@ -30,7 +31,7 @@ def guided_filter(image: Tensor, *, radius: int = 6, eps: float = 1e-4) -> Calla
         A function of (d, h, w) planes, which returns as many; on the CPU, not differentiable.
 
     Raises:
-        ShapeError: an image of another shape; later, planes of another size than the image.
+        ShapeError, DTypeError: an image of another shape or dtype; later, planes of another size than the image.
         OptionError: a radius below 1, or an ``eps`` that is not positive.
 
     Example:
@@ -44,16 +45,16 @@ def guided_filter(image: Tensor, *, radius: int = 6, eps: float = 1e-4) -> Calla
         >>> bool((smooth - step).std() < 0.3 * noise.std())
         True
     """
+    check_float("guided_filter", "image", image, "(1, h, w) or (3, h, w)")
     if image.ndim != 3 or image.shape[0] not in (1, 3):
         raise ShapeError(f"guided_filter: image must be (1, h, w) or (3, h, w); got {tuple(image.shape)}")
-    if radius < 1:
-        raise OptionError(f"guided_filter: radius must be at least 1; got {radius}")
-    if not 0 < eps < float("inf"):
+    radius = check_whole("guided_filter", "radius", radius, 1, 2**15)
+    if not check_number("guided_filter", "eps", eps, "positive and finite") > 0:
         raise OptionError(f"guided_filter: eps must be positive and finite; got {eps}")
     import cv2
 
     guide = np.ascontiguousarray(image.detach().cpu().float().permute(1, 2, 0).numpy())
-    made = cv2.ximgproc.createGuidedFilter(guide, radius, eps)
+    made = cv2.ximgproc.createGuidedFilter(guide, radius, float(eps))
 
     def filtered(planes: Tensor) -> Tensor:
         if planes.ndim != 3 or planes.shape[1:] != image.shape[1:]:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from lsmgeo.classical import guided_filter
-from lsmgeo.errors import OptionError, ShapeError
+from lsmgeo.errors import DTypeError, OptionError, ShapeError
 
 
 def written_out(image, plane, radius, eps):
@@ -67,8 +67,14 @@ def test_wrong_arguments_are_named():
     image = torch.rand(3, 12, 15)
     with pytest.raises(ShapeError, match=r"image must be .* got \(2, 12, 15\)"):
         guided_filter(image[:2])
-    with pytest.raises(OptionError, match="radius must be at least 1; got 0"):
+    with pytest.raises(OptionError, match="radius must be a whole number from 1 to 32768; got int 0"):
         guided_filter(image, radius=0)
+    with pytest.raises(OptionError, match=r"radius must be a whole number .* got float"):
+        guided_filter(image, radius=1.5)
+    with pytest.raises(OptionError, match="eps must be positive and finite; got str"):
+        guided_filter(image, eps="small")
+    with pytest.raises(DTypeError, match="image must be a tensor"):
+        guided_filter(None)
     with pytest.raises(OptionError, match="eps must be positive and finite; got 0"):
         guided_filter(image, eps=0.0)
     with pytest.raises(ShapeError, match=r"image's size \(12, 15\); got \(1, 12, 14\)"):

@@ -103,6 +103,8 @@ def reconstruct_hull(
     check_whole(who, "resolution", resolution, 8, 1024)
     check_whole(who, "size", size, 16)
     chosen = list(range(len(scene)) if views is None else views)
+    if not chosen:
+        raise OptionError(f"{who}: views must name one view at least; got {views}")
     found = silhouettes(scene, chosen, folder=folder, background=background)
     for view, mask in zip(chosen, found, strict=True):
         if not bool(mask.any()):

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from lsmgeo import functional
-from lsmgeo._checks import check_choice, check_float, check_number, check_size, check_whole
+from lsmgeo._checks import check_choice, check_float, check_mask, check_number, check_size, check_whole
 from lsmgeo.cameras import CameraTensors, select
 from lsmgeo.cameras.tensors import Cameras, as_tensors
 from lsmgeo.classical.correlation import UNRELATED, Correlation, on_threads
@@ -310,6 +310,7 @@ def aggregate_views(
 
     Raises:
         OptionError: `best` or `min_views` is no number from 1 to that of the neighbours.
+        ShapeError, DTypeError: costs or visible of another shape or dtype.
 
     Example:
         >>> import torch
@@ -318,6 +319,8 @@ def aggregate_views(
         >>> cost.item(), count.item()
         (0.20000000298023224, 3)
     """
+    check_float("aggregate_views", "costs", costs, "(V-1, P, h, w)", rank=4)
+    check_mask("aggregate_views", "visible", visible, tuple(costs.shape), "of the shape of costs")
     number = costs.shape[0]
     best, min_views = _numbers(number, best, min_views)
     count = visible.sum(0)

@@ -92,6 +92,7 @@ def sweep_results(
         DataError: a photograph cannot be read.
     """
     check_whole("reconstruct", "resolution", resolution, 8, MOST_VOXELS)
+    check_whole("reconstruct", "neighbours", options["neighbours"], 1)
     if density is not None:
         options |= {"density": density}
     notes: tuple[str, ...] = ()

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 from tqdm import tqdm
 
-from lsmgeo._checks import check_float, check_whole
+from lsmgeo._checks import check_float, check_number, check_whole
 from lsmgeo.cameras import resize
 from lsmgeo.cameras.tensors import Cameras
 from lsmgeo.classical.matching import UNRELATED, aggregated_costs
@@ -163,7 +163,7 @@ def kept(depth_map: DepthMap, density: float, least: float = 0.0, specks: int = 
         (h, w) bool.
 
     Raises:
-        OptionError: a density outside (0, 1].
+        OptionError: a density outside (0, 1], or specks that are no whole number.
 
     Example:
         >>> import torch
@@ -173,8 +173,10 @@ def kept(depth_map: DepthMap, density: float, least: float = 0.0, specks: int = 
         tensor([[ True, False],
                 [False,  True]])
     """
-    if not 0 < density <= 1:
+    if not 0 < check_number("kept", "density", density, "a number in (0, 1]") <= 1:
         raise OptionError(f"kept: density must lie in (0, 1]; got {density}")
+    check_number("kept", "least", least, "a number")
+    check_whole("kept", "specks", specks, 0, 2**31 - 1)
     confidence = torch.where(depth_map.depth > 0, depth_map.confidence, 0.0)
     # The margin keeps a product that is whole but for rounding: 0.29 * 100 is 28.999999999999996.
     number = math.floor(density * confidence.numel() + 1e-6)

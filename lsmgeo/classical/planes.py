@@ -38,7 +38,8 @@ def sweep_planes(
         (P,) float64, ascending.
 
     Raises:
-        OptionError: an unknown spacing, a step that is not positive or asks for more than 2^20 planes.
+        OptionError: an unknown spacing, a range that is no two finite numbers, a step that is not positive or asks for
+            more than 2^20 planes.
         GridError: near and far not positive and ascending.
 
     Example:
@@ -51,6 +52,7 @@ def sweep_planes(
     who = "sweep_planes"
     check_choice(who, "spacing", spacing, ("inverse", "depth", "disparity"))
     num = check_whole(who, "num", num, 3, MOST_PLANES)
+    near, far = (check_number(who, name, end, "a number") for name, end in (("near", near), ("far", far)))
     ends = (torch.tensor(near, dtype=torch.float64), torch.tensor(far, dtype=torch.float64))
     if spacing != "disparity":
         return depth_planes(*ends, num, spacing=spacing)

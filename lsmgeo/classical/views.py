@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from lsmgeo._checks import check_whole
 from lsmgeo.cameras import CameraTensors, resize
 from lsmgeo.data import PosedImages
 from lsmgeo.errors import OptionError
@@ -70,6 +71,8 @@ def select_neighbours(
     Raises:
         OptionError: no other view is usable, or the depth range is needed and cannot be told.
     """
+    check_whole("select_neighbours", "view", view, 0, len(scene) - 1)
+    check_whole("select_neighbours", "count", count, 1)
     centers = camera_centers(scene.cameras)
     frustum = np.empty((0, 3))
     if scene.points is None:
@@ -141,6 +144,7 @@ def measured_depth_range(scene: PosedImages, view: int) -> tuple[float, float] |
     Raises:
         DataError: the depth that comes with the photograph cannot be read.
     """
+    check_whole("measured_depth_range", "view", view, 0, len(scene) - 1)
     E = scene.cameras.cam_from_world[view].double().numpy()
     depth = np.empty(0)
     if scene.points is not None:

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from lsmgeo import VoxelGrid
+from lsmgeo import VoxelGrid, data
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.classical import SurfaceMesh
-from lsmgeo.classical.hull_scene import HullView, colour_vertices, hull_depth
+from lsmgeo.classical.hull_scene import HullView, colour_vertices, hull_depth, reconstruct_hull
+from lsmgeo.errors import OptionError
+from tests.data.writers import make_scene, write_middlebury
 
 K = torch.tensor([[20.0, 0.0, 7.5], [0.0, 20.0, 5.5], [0.0, 0.0, 1.0]])
 
@@ -37,6 +39,12 @@ def test_a_camera_within_a_hull_sees_what_lies_before_it(z):
     depth = hull_depth(torch.ones(8, 8, 8, dtype=torch.bool), VoxelGrid(8), camera_at(z))
     # A voxel before the camera is its own surroundings.
     assert bool((depth > 0).all()) == bool((depth > 0).any()) == (0.5 - z > 1.5 / 8)
+
+
+def test_no_views_have_no_hull(tmp_path):
+    read = data.open(write_middlebury(make_scene(), tmp_path))
+    with pytest.raises(OptionError, match="views must name one view at least"):
+        reconstruct_hull(read, [], background="black")
 
 
 @pytest.mark.parametrize("x", [-0.4, 0.0, 7.0, 15.4])

@@ -297,3 +297,11 @@ def test_wrong_numbers_of_views_are_named(change):
     costs = torch.rand(3, 2, 4, 5)
     with pytest.raises(OptionError, match=f"{next(iter(change))} must be a whole number from 1 to 3"):
         aggregate_views(costs, costs > 0, **change)
+
+
+def test_costs_without_what_is_seen_are_refused():
+    costs = torch.rand(3, 2, 4, 5)
+    with pytest.raises(DTypeError, match="costs must be a tensor"):
+        aggregate_views(None, costs > 0)
+    with pytest.raises(ShapeError, match=r"visible must be of the shape of costs = \(3, 2, 4, 5\); got \(1, 2, 4, 5\)"):
+        aggregate_views(costs, costs[:1] > 0)

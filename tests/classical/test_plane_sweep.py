@@ -305,6 +305,8 @@ def test_three_hundred_planes_by_default():
         ({"num": 2}, OptionError, "num must be a whole number from 3"),
         ({"spacing": "disparity", "step": 0.0}, OptionError, "step must be a positive number of pixels"),
         ({"spacing": "disparity", "step": 1e-6}, OptionError, "step must be larger"),
+        ({"near": "1"}, OptionError, "near must be a number; got str '1'"),
+        ({"far": None}, OptionError, "far must be a number; got NoneType"),
         ({"near": 4.0}, GridError, "near and far must be positive, finite and ascending"),
         ({"near": -1.0, "spacing": "disparity"}, GridError, "near and far must be positive, finite and ascending"),
     ],

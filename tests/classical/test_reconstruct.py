@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from lsmgeo import data
-from lsmgeo.classical import reconstruct_scene, reconstruct_view, select_neighbours
+from lsmgeo.classical import default_depth_range, reconstruct_scene, reconstruct_view, select_neighbours
 from lsmgeo.errors import OptionError
 from tests.data.writers import make_scene, write_colmap, write_middlebury
 
@@ -46,6 +46,16 @@ def test_points_and_surface_lie_on_the_plane(whole):
     assert np.median(np.abs(whole.points @ NORMAL)) < 2e-3
     assert len(whole.mesh.faces) > 100
     assert np.median(np.abs(np.asarray(whole.mesh.vertices) @ NORMAL)) < 5e-3
+
+
+def test_views_that_do_not_exist_are_named(read):
+    for view in (-1, len(read), 1.5):
+        with pytest.raises(OptionError, match="view must be a whole number from 0 to"):
+            select_neighbours(read, view, 2)
+        with pytest.raises(OptionError, match="view must be a whole number from 0 to"):
+            default_depth_range(read, view)
+    with pytest.raises(OptionError, match="count must be a whole number, at least 1; got int 0"):
+        select_neighbours(read, 0, 0)
 
 
 def test_points_at_one_place_have_no_surface():

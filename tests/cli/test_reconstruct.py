@@ -261,7 +261,7 @@ def _fits(memory):
         (["--view", "nobody.png"], "a photograph's name; got 'nobody.png'"),
         (["--density", "0"], "density must lie in"),
         (["--density", "2"], "density must lie in (0, 1]; got 2.0"),
-        (["--neighbours", "0"], "neighbours must be at least 1"),
+        (["--neighbours", "0"], "neighbours must be a whole number, at least 1; got int 0"),
         (["--size", "3"], "size must be at least 16"),
         (["--size", "0"], "size must be at least 16; got 0"),
         (["--planes", "2"], "planes must be at least 3"),
@@ -434,6 +434,9 @@ def test_kept_pixels_are_the_best_and_specks_go():
     depth_map = DepthMap(torch.ones(8, 8), confidence, torch.zeros(8, 8), torch.full((8, 8), 5.0))
     assert int(kept(depth_map, 0.25).sum()) == 16
     assert int(kept(depth_map, 1.0, least=0.5).sum()) == 32
+    for options, message in (({"density": "all"}, "density must be"), ({"density": 1.0, "specks": 1.5}, "specks must")):
+        with pytest.raises(OptionError, match=message):
+            kept(depth_map, **options)
     planes = torch.full((8, 8), 5.0)
     planes[6, 6] = 20.0
     mask = kept(depth_map._replace(planes=planes), 0.25, specks=4)

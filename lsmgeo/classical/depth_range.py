@@ -13,8 +13,8 @@ from lsmgeo.data import PosedImages
 
 __all__ = ["find_depth_range"]
 
-# The coarse sweep: longer side in pixels, planes, and how much nearer and farther it looks than the cameras tell.
-SIZE, PLANES = 160, 160
+# Planes of the coarse sweep, and how much nearer and farther it looks than the cameras tell.
+PLANES = 160
 NEARER, FARTHER = 0.3, 4.0
 # The best pixels that are believed, how certain they must be, and the least fraction that says anything.
 DENSITY, CONFIDENCE, LEAST = 0.8, 0.3, 0.02
@@ -22,12 +22,18 @@ MARGIN = 0.15
 
 
 def find_depth_range(
-    scene: PosedImages, view: int, *, neighbours: int = 4, noise: float = 2 / 255
+    scene: PosedImages,
+    view: int,
+    *,
+    neighbours: int = 4,
+    size: int = 160,
+    noise: float = 2 / 255,
+    memory: int = 1 << 30,
 ) -> tuple[float, float]:
     """Nearest and farthest depth of what a view shows.
 
     From sparse points or measured depth where there are any (`lsmgeo.classical.default_depth_range`). Else a sweep of
-    the photograph at 160 pixels, from far nearer to far farther than the place that the cameras look at; the range is
+    the reduced photograph, from far nearer to far farther than the place that the cameras look at; the range is
     that of its most certain pixels (their 1st and 99th percentile in inverse depth, widened). Where too few are
     certain, the place where the optical axes meet decides, as there.
 
@@ -35,7 +41,9 @@ def find_depth_range(
         scene: the posed photographs.
         view: index of the view.
         neighbours: how many other views to match with, at most.
+        size: longer side of the reduced photograph in pixels.
         noise: standard deviation of luminance that counts as no texture.
+        memory: bound in bytes on what the sweep adds to the process.
 
     Returns:
         Camera z, world units.
@@ -48,11 +56,17 @@ def find_depth_range(
     if measured_depth_range(scene, view) is not None:
         return near, far
     chosen = select_neighbours(scene, view, neighbours, near=near, far=far)
-    images, cameras = gather(scene, (view, *chosen), SIZE)
+    images, cameras = gather(scene, (view, *chosen), size)
     middle = float(np.sqrt(near * far))
     depths = sweep_planes(cameras, min(near, NEARER * middle), max(far, FARTHER * middle), PLANES)
     depth_map = sweep(
-        images, cameras, depths, min_views=min(2, len(chosen)), cost_filter=guided_filter(images[0]), noise=noise
+        images,
+        cameras,
+        depths,
+        min_views=min(2, len(chosen)),
+        cost_filter=guided_filter(images[0]),
+        noise=noise,
+        memory=memory,
     )
     mask = kept(depth_map, DENSITY, CONFIDENCE)
     if float(mask.float().mean()) < LEAST:

@@ -11,7 +11,7 @@ from torch.nn.functional import interpolate
 from lsmgeo.cameras import CameraTensors, resize, stack
 from lsmgeo.data import PosedImages
 
-__all__ = ["gather"]
+__all__ = ["gather", "resized"]
 
 
 def gather(scene: PosedImages, views: Sequence[int], size: int) -> tuple[Tensor, CameraTensors]:
@@ -33,11 +33,12 @@ def gather(scene: PosedImages, views: Sequence[int], size: int) -> tuple[Tensor,
     height, width = scene.size(views[0])
     scale = min(1.0, size / max(height, width))
     shape = max(1, round(height * scale)), max(1, round(width * scale))
-    images = torch.stack([_resized(scene.load(view), shape) for view in views])
+    images = torch.stack([resized(scene.load(view), shape) for view in views])
     return images, stack([resize(scene.camera(view), *shape) for view in views])
 
 
-def _resized(image: Tensor, shape: tuple[int, int]) -> Tensor:
+def resized(image: Tensor, shape: tuple[int, int]) -> Tensor:
+    """An image (C, H, W) in [0, 1] at the size (h, w), smoothed where it shrinks."""
     if tuple(image.shape[1:]) == shape:
         return image
     return interpolate(image[None], shape, mode="bilinear", antialias=True)[0].clamp(0, 1)

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 from tqdm import tqdm
 
 from lsmgeo import functional
 from lsmgeo._checks import check_choice, check_whole
 from lsmgeo.cameras import CameraTensors, crop, resize, stack
+from lsmgeo.classical.gathering import resized
 from lsmgeo.classical.silhouettes import signed_distance, silhouettes
 from lsmgeo.classical.surface import SurfaceMesh, drop_specks, extract_mesh
 from lsmgeo.classical.tsdf import voxel_side
@@ -113,7 +113,7 @@ def reconstruct_hull(
     scale = min(1.0, size / max(height, width))
     shape = max(1, round(height * scale)), max(1, round(width * scale))
     cameras = stack([resize(scene.camera(view), *shape) for view in chosen])
-    masks = torch.stack([_resized(mask[None].float(), shape)[0] > 0.5 for mask in found])
+    masks = torch.stack([resized(mask[None].float(), shape)[0] > 0.5 for mask in found])
     grid = default_grid(masks, cameras, resolution)
     border = masks.clone()
     border[:, 1:-1, 1:-1] = False
@@ -131,7 +131,7 @@ def reconstruct_hull(
             depth = hull_depth(hull.occupancy, grid, camera)
             both = (depth > 0) & masks[index]
             iou = float(both.sum()) / max(1, int(((depth > 0) | masks[index]).sum()))
-            looked.append(HullView(view, _resized(scene.load(view), shape), camera, masks[index], depth, iou))
+            looked.append(HullView(view, resized(scene.load(view), shape), camera, masks[index], depth, iou))
     mesh = drop_specks(extract_mesh(hull.support, grid, level=level), SPECK_FACES)
     return HullScene(tuple(looked), hull.occupancy, grid, colour_vertices(mesh, looked, BEHIND * voxel_side(grid)))
 
@@ -220,9 +220,3 @@ def colour_vertices(mesh: SurfaceMesh, views: Sequence[HullView], behind: float)
     mean = torch.where(weight > 0, total / weight.clamp_min(1e-12), 0.7)
     rounded = (mean.T * 255).round().clamp(0, 255).to(torch.uint8).numpy()
     return SurfaceMesh(mesh.vertices, mesh.faces, rounded)
-
-
-def _resized(image: Tensor, shape: tuple[int, int]) -> Tensor:
-    if tuple(image.shape[1:]) == shape:
-        return image
-    return interpolate(image[None], shape, mode="bilinear", antialias=True)[0].clamp(0, 1)

@@ -16,6 +16,7 @@ from lsmgeo.classical.report_page import ReportPicture, ReportView, make_page
 from lsmgeo.classical.surface import write_mesh
 from lsmgeo.data.cameras_json import FORMAT, NAME, VERSION
 from lsmgeo.data.files import write_atomic, write_point_cloud
+from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -109,10 +110,16 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
         model=_model_of(scene, results),
     )
     written = {}
+    # What an earlier run left, and this one does not write again, is not of these results.
     if mesh is not None and len(mesh.faces):
         written["mesh"] = write_mesh(folder / "model.glb", mesh)
         write_mesh(folder / "model.ply", mesh)
-    if len(results.points):
+    else:
+        _remove(folder / "model.glb")
+        _remove(folder / "model.ply")
+    if not len(results.points):
+        _remove(folder / "points.ply")
+    else:
         written["points"] = write_point_cloud(folder / "points.ply", results.points, results.colours)
     written["page"] = write_atomic(folder / "report.html", page.encode())
     written["summary"] = write_atomic(folder / "summary.png", summary)
@@ -123,6 +130,13 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
     # Last, so that it never names what is not there.
     written["cameras"] = write_atomic(folder / NAME, json.dumps(stated, indent=1, allow_nan=False).encode())
     return written
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise DataError(path, f"cannot be removed ({error.strerror})") from error
 
 
 def file_names(names: Sequence[str]) -> list[str]:

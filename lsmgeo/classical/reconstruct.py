@@ -20,7 +20,7 @@ from lsmgeo.classical.gathering import gather
 from lsmgeo.classical.plane_sweep import DepthMap, kept, sweep
 from lsmgeo.classical.planes import MOST_PLANES, sweep_planes
 from lsmgeo.classical.sparse import SparseError, sparse_error
-from lsmgeo.classical.views import camera_centers, select_neighbours
+from lsmgeo.classical.views import camera_centers, default_depth_range, select_neighbours
 from lsmgeo.data import PosedImages
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid
@@ -43,6 +43,8 @@ SPECK_FRACTION = 5e-4
 # Standard deviation of luminance that counts as no texture.
 NOISE = 0.5 / 255
 SPECK_FACES = 100
+# Longer side in pixels of the sweep that looks for a depth range.
+COARSE_SIZE = 160
 # With so many other depth maps, the nearest views', a depth map is compared at most.
 MOST_CHECKED = 12
 
@@ -264,7 +266,11 @@ class _Sweeper:
     def depth_range(self, view: int) -> tuple[float, float]:
         near, far = self.near, self.far
         if near is None or far is None:
-            lower, upper = find_depth_range(self.scene, view, noise=NOISE)
+            lower, upper = find_depth_range(
+                self.scene, view, size=min(COARSE_SIZE, self.size), noise=NOISE, memory=self.memory
+            )
+            if (near or lower) >= (far or upper):
+                lower, upper = default_depth_range(self.scene, view)
             near, far = near if near is not None else lower, far if far is not None else upper
         if not 0 < near < far < float("inf"):
             raise OptionError(f"near and far must be positive, finite and ascending; got {near} and {far}")

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from lsmgeo import data
-from lsmgeo.classical import default_depth_range, find_depth_range
+from lsmgeo.classical import default_depth_range, find_depth_range, reconstruct_view
 from lsmgeo.errors import OptionError
 from tests.classical.analytic import texture
 from tests.data.writers import make_scene, write_colmap
@@ -79,3 +79,11 @@ def test_cameras_in_one_place_tell_nothing(tmp_path):
     same = data.PosedImages(scene.names, scene.paths, scene.cameras._replace(cam_from_world=E), None, scene.source)
     with pytest.raises(OptionError, match="view 0: the cameras look at no common point; give near and far"):
         default_depth_range(same, 0)
+
+
+def test_a_given_end_beyond_the_found_range_falls_back_on_the_cameras(tmp_path, monkeypatch):
+    scene, _ = write_photographs(tmp_path, (0.0, 0.0, 0.0))
+    near, far = default_depth_range(scene, 0)
+    monkeypatch.setattr("lsmgeo.classical.reconstruct.find_depth_range", lambda *_, **__: (0.1 * near, 0.2 * near))
+    one = reconstruct_view(scene, 0, near=near, planes=8, size=32)
+    np.testing.assert_allclose([one.depths[0], one.depths[-1]], [near, far])

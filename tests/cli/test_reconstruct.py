@@ -176,12 +176,15 @@ def test_a_scene_without_silhouettes_has_no_hull_and_says_what_to_name(folder, t
 def test_photographs_without_texture_give_a_warning_and_status_1(scene, tmp_path, capsys):
     flat = scene._replace(images=np.full_like(scene.images, 90))
     out = tmp_path / "out"
+    out.mkdir()
+    for name in ("points.ply", "model.glb", "model.ply"):
+        (out / name).write_text("of an earlier run")
     arguments = ["reconstruct", str(write_middlebury(flat, tmp_path / "scene")), "--near", "1.5", "--far", "2.6"]
     assert cli.main([*arguments, "--view", "0", "--planes", "16", "--out", str(out)]) == 1
     assert "warning: No pixel was kept" in capsys.readouterr().err
     assert "No pixel was kept" in (out / "report.html").read_text()
-    assert not (out / "points.ply").exists()
-    assert not (out / "model.glb").exists()
+    for name in ("points.ply", "model.glb", "model.ply"):
+        assert not (out / name).exists()
 
 
 def test_a_damaged_photograph_is_left_out_and_named(scene, tmp_path, capsys):

@@ -121,7 +121,7 @@ def reconstruct(
         far: for sweeps, farthest depth.
         score: for sweeps, how patches are compared.
         window: for sweeps, side of the patches in pixels.
-        density: for sweeps, largest fraction of the pixels to keep; by default 0.4 of one view, 0.8 of all.
+        density: for sweeps, largest fraction of the pixels to keep; by default 0.8, or 0.4 of one view alone.
         check: for the sweep of one view, how many of its neighbours are swept too; they must agree with it. 0 takes a
             third of the time.
         resolution: voxels along the longest side of the box in which the mesh is made.
@@ -129,8 +129,8 @@ def reconstruct(
             forgives wrong ones.
         masks: for hulls, a folder of silhouettes; by default alpha, or a folder masks or silhouettes beside the
             photographs.
-        background: for hulls, the colour behind the object where nothing else tells its silhouettes: white, black, or
-            three numbers such as 0.1,0.8,0.2.
+        background: for hulls, the colour behind the object, which then tells the silhouettes, whatever else could:
+            white, black, or three numbers such as 0.1,0.8,0.2.
         memory: for sweeps, MiB that one may take.
 
     Returns:

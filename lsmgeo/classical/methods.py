@@ -24,7 +24,6 @@ __all__ = ["hull_results", "readable", "sweep_results"]
 MOST_NAMED = 5
 # Kept pixels below this fraction are worth a word.
 FEW = 0.05
-DENSITY_OF_ONE = 0.4
 # Along the longest side of the mesh's box.
 MOST_VOXELS = 1024
 
@@ -99,7 +98,7 @@ def sweep_results(
     mesh: SurfaceMesh | None = None
     views: tuple[Reconstruction, ...]
     if view is not None:
-        one = _checked_view(scene, view, check, {"density": DENSITY_OF_ONE} | options)
+        one = _checked_view(scene, view, check, options)
         views, points, colours = (one,), one.points, one.colours
         mesh = surface_of(views, points, resolution) if len(points) else None
     else:
@@ -127,8 +126,10 @@ def sweep_results(
         together = ", checked against each other and fused" if len(views) > 1 else ""
         facts.append(("views", f"{len(views)} of {len(scene)} swept{together}"))
     height, width = first.mask.shape
-    low, high = min(float(one.depths[0]) for one in views), max(float(one.depths[-1]) for one in views)
-    facts.append(("sweep", f"{width} x {height} pixels, {len(first.depths)} planes from {low:.4g} to {high:.4g}"))
+    low, high = (float(np.median([one.depths[end] for one in views])) for end in (0, -1))
+    typical = " (the middle of the views' own ranges)" if len(views) > 1 else ""
+    planes = f"{len(first.depths)} planes from {low:.4g} to {high:.4g}{typical}"
+    facts.append(("sweep", f"{width} x {height} pixels, {planes}"))
     facts.append(("memory", f"at most {options['memory'] >> 20} MiB a sweep beyond the libraries and the photographs"))
     facts.append(("kept", f"{pixels} pixels, {100 * pixels / whole:.1f} %"))
     errors = [one.error for one in views if one.error is not None and one.error.points]
@@ -204,8 +205,9 @@ def hull_results(
     if ious[worst] < 0.8:
         name = scene.names[hull.views[worst].view]
         notes.append(
-            f"The hull fills only {100 * ious[worst]:.0f} % of the silhouette of {name}: silhouettes or cameras do not "
-            "agree with each other. Look at the silhouettes below, or try --rule mean."
+            f"The silhouette of {name} and the hull have an IoU of {ious[worst]:.2f} alone. Where the silhouette holds "
+            "more than the object, that is background, and harmless; where the hull lacks a piece of it, another "
+            "silhouette or a camera is wrong, which --rule mean forgives."
         )
     ordered = sorted(hull.views, key=lambda one: one.view != view) if view is not None else hull.views
     nothing = np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8)

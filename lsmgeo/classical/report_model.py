@@ -116,10 +116,13 @@ def _frusta(
     if len(centers) > 1:
         from scipy.spatial import cKDTree
 
-        gaps = cKDTree(centers).query(centers, k=2)[0][:, 1]
+        # Cameras that turned in their place have no gap.
+        gaps = cKDTree(np.unique(centers.round(6), axis=0)).query(centers, k=2)[0].max(1)
         length = float(np.clip(FRUSTUM_OF_GAP * np.median(gaps), 0.1, LONGEST_FRUSTUM))
     lines, colours = [], []
-    for view, ((height, width), center) in enumerate(zip(sizes, centers, strict=True)):
+    # The first is drawn last: it is seen where another stands in its place.
+    for view in sorted(range(len(centers)), key=lambda view: view == model.used[0]):
+        (height, width), center = sizes[view], centers[view]
         left, right, top, bottom = -0.5, width - 0.5, -0.5, height - 0.5
         roof = top - 0.25 * height
         corners = [(left, top), (right, top), (right, bottom), (left, bottom)]

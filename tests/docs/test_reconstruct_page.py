@@ -2,9 +2,11 @@
 
 import inspect
 import re
+import textwrap
 from pathlib import Path
 
 from lsmgeo import classical, cli
+from lsmgeo.metrics import depth_errors
 
 ROOT = Path(__file__).resolve().parents[2]
 GUIDE = (ROOT / "docs" / "reconstruct.rst").read_text(encoding="utf-8")
@@ -37,6 +39,16 @@ def test_defaults_are_as_said():
     assert default(classical.consistent_views, "pixels") == 1.0
     assert default(classical.consistent_views, "relative") == 0.01
     assert OPTIONS["rule"].default == "all"
+
+
+def test_each_step_runs_as_it_stands(tmp_path, monkeypatch, capsys):
+    block = re.search(r":name: each-step\n\n((?:   .*\n|\n)+)", GUIDE)[1]
+    monkeypatch.chdir(tmp_path)
+    found = {}
+    exec(compile(textwrap.dedent(block), "each-step", "exec"), found)
+    assert capsys.readouterr().out.startswith("depth: DepthErrors(")
+    assert float(depth_errors(found["found"].depth, found["truth"][0], found["best"]).abs_rel) < 1e-3
+    assert (tmp_path / "model.glb").stat().st_size > 10_000
 
 
 def test_functions_that_are_named_exist():

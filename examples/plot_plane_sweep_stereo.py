@@ -67,7 +67,7 @@ for density, error in zip(curve.density, curve.error, strict=True):
 figure, axes = plt.subplots(2, 3, figsize=(11, 5.8), layout="constrained")
 axes[0, 0].imshow(images[0].permute(1, 2, 0))
 axes[0, 0].plot(column, row, "rx")
-axes[0, 0].set_title("the photograph, and the pixel above")
+axes[0, 0].set_title("the photograph, that pixel")
 shown = axes[0, 1].imshow(truth, cmap="turbo_r", vmin=1.5, vmax=2.7)
 axes[0, 1].set_title("exact depth")
 axes[0, 2].imshow(found.depth, cmap="turbo_r", vmin=1.5, vmax=2.7)

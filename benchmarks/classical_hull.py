@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -75,9 +74,7 @@ def temple(scene: PosedImages) -> list[Row]:
     grid = VoxelGrid(RESOLUTION, *hull_box(masks, scene.cameras))
     found = []
     for rule, name in (("all", "strict intersection"), ("mean", "mean above 0.75")):
-        start = time.perf_counter()
         hull = visual_hull(given, scene.cameras, grid, rule=rule)
-        seconds = time.perf_counter() - start
         drawn = [
             project_back(hull.occupancy, grid, select(scene.cameras, 0, view), scene.size(view))
             for view in range(len(scene))
@@ -103,7 +100,6 @@ def temple(scene: PosedImages) -> list[Row]:
                 f"<= {1000 * FARTHEST:.0f} mm" if strict else "",
                 far <= 1000 * FARTHEST if strict else None,
             ),
-            Row(section, f"{name}: carving", f"{seconds:.1f} s", "", None),
         ]
     return found
 

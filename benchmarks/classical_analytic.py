@@ -1,4 +1,4 @@
-"""Depth of textured surfaces known in closed form, by plane sweep: ``python -m benchmarks.classical_analytic``.
+"""Depth of textured surfaces known in closed form, by plane sweep: ``python -m benchmarks.classical --only analytic``.
 
 The pictures are traced by `tests.classical.analytic`, which shares no code with the library: 96 x 72 pixels, four
 views, 64 planes even in inverse depth, 5 x 5 correlation; pixels nearer than three to the surface's end are left out.
@@ -79,8 +79,3 @@ def rows(root: Path | None = None) -> list[Row]:
             )
         )
     return found
-
-
-if __name__ == "__main__":
-    for row in rows():
-        print(*row, sep="  ")

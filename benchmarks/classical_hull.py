@@ -1,4 +1,4 @@
-"""Visual hulls of a real temple and of synthetic shapes: ``python -m benchmarks.classical_hull``.
+"""Visual hulls of a real temple and of synthetic shapes: ``python -m benchmarks.classical --only hull``.
 
 The temple's hull is carved in a box told from its silhouettes alone. To compare, its occupancy is projected back into
 every photograph by our own plane sweep (the nearest voxel at depths a voxel apart, the largest along each ray) and laid
@@ -7,9 +7,6 @@ over the silhouette that was given.
 
 from __future__ import annotations
 
-import argparse
-import os
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -144,18 +141,3 @@ def rows(root: Path | None = None) -> list[Row]:
     """The lines of the table; the temple only where the folder of sets is given."""
     real = temple(open_scene(root / "middlebury_temple")) if root is not None else []
     return [*real, *synthetic()]
-
-
-def main() -> int:
-    """Print the lines; 1 if a goal is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=os.environ.get("LSMGEO_TEST_DATA"), help="folder of the sets")
-    found = rows(parser.parse_args().data)
-    for row in found:
-        mark = "" if row.reached is None else "reached" if row.reached else "MISSED"
-        print(f"{row.section}\n  {row.what}\n    {row.measured}  {row.goal}  {mark}")
-    return int(any(row.reached is False for row in found))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""A plane sweep against loops of OpenCV and warps of kornia: ``python -m benchmarks.classical_speed``.
+"""A plane sweep against loops of OpenCV and warps of kornia: ``python -m benchmarks.classical --only speed``.
 
 One view of 640 x 480 pixels with four neighbours, 300 planes, correlation over 5 x 5 pixels, the mean of the better
 half of the neighbours, and the plane where it is lowest. The pictures are an analytic scene's
@@ -222,8 +222,3 @@ def rows(root: Path | None = None) -> list[Row]:
         text = f"{added / 2**20:.0f} MiB"
         found.append(Row(name, "memory added to the process", text, f"at most {MEMORY >> 20} MiB", added <= MEMORY))
     return found
-
-
-if __name__ == "__main__":
-    for row in rows():
-        print(*row, sep="  ")

@@ -1,8 +1,7 @@
-"""How true surfaces fused from exact depth are: solids seen from all round, ``python -m benchmarks.classical_tsdf``."""
+"""How true surfaces fused from exact depth are: ``python -m benchmarks.classical --only tsdf``."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -155,16 +154,3 @@ def rows(root: Path | None = None) -> list[Row]:
         what = f"{case.name}: closed, {len(mesh.faces)} faces"
         found.append(Row("TSDF, exact depth", what, "yes" if closed else "no", "yes", closed))
     return found
-
-
-def main() -> int:
-    """Print the lines; 1 if a goal is missed."""
-    found = rows()
-    for row in found:
-        mark = "" if row.reached is None else "reached" if row.reached else "MISSED"
-        print(f"{row.what:<70} {row.measured:<70} {row.goal:<45} {mark}")
-    return int(any(row.reached is False for row in found))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

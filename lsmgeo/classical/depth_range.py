@@ -52,9 +52,10 @@ def find_depth_range(
         OptionError: the depth cannot be told, or the view has no neighbours.
         DataError: a photograph cannot be read.
     """
+    measured = measured_depth_range(scene, view)
+    if measured is not None:
+        return measured
     near, far = default_depth_range(scene, view)
-    if measured_depth_range(scene, view) is not None:
-        return near, far
     chosen = select_neighbours(scene, view, neighbours, near=near, far=far)
     images, cameras = gather(scene, (view, *chosen), size)
     middle = float(np.sqrt(near * far))

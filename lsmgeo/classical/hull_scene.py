@@ -12,8 +12,8 @@ from tqdm import tqdm
 
 from lsmgeo import functional
 from lsmgeo._checks import check_choice, check_whole
-from lsmgeo.cameras import CameraTensors, crop, resize, stack
-from lsmgeo.classical.gathering import resized
+from lsmgeo.cameras import CameraTensors, crop, resize, select, stack
+from lsmgeo.classical.gathering import resized, working_size
 from lsmgeo.classical.silhouettes import signed_distance, silhouettes
 from lsmgeo.classical.surface import SurfaceMesh, drop_specks, extract_mesh
 from lsmgeo.classical.tsdf import voxel_side
@@ -109,9 +109,7 @@ def reconstruct_hull(
     for view, mask in zip(chosen, found, strict=True):
         if not bool(mask.any()):
             raise OptionError(f"{who}: the silhouette of view {view} ({scene.names[view]}) is empty")
-    height, width = scene.size(chosen[0])
-    scale = min(1.0, size / max(height, width))
-    shape = max(1, round(height * scale)), max(1, round(width * scale))
+    shape = working_size(scene, chosen[0], size)
     cameras = stack([resize(scene.camera(view), *shape) for view in chosen])
     masks = torch.stack([resized(mask[None].float(), shape)[0] > 0.5 for mask in found])
     grid = default_grid(masks, cameras, resolution)
@@ -127,7 +125,7 @@ def reconstruct_hull(
     looked = []
     with tqdm(chosen, desc="hull", unit="view", disable=None if progress else True) as bar:
         for index, view in enumerate(bar):
-            camera = CameraTensors(*(torch.as_tensor(value)[index] for value in cameras))
+            camera = select(cameras, 0, index)
             depth = hull_depth(hull.occupancy, grid, camera)
             both = (depth > 0) & masks[index]
             iou = float(both.sum()) / max(1, int(((depth > 0) | masks[index]).sum()))

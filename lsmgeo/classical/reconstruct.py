@@ -12,7 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lsmgeo._checks import check_whole
-from lsmgeo.cameras import CameraTensors, rays, stack
+from lsmgeo.cameras import CameraTensors, rays, select, stack
 from lsmgeo.classical.consistency import consistent_views
 from lsmgeo.classical.depth_range import find_depth_range
 from lsmgeo.classical.filtering import guided_filter
@@ -295,7 +295,7 @@ class _Sweeper:
             memory=self.memory,
             progress=progress,
         )
-        camera = CameraTensors(*(torch.as_tensor(value)[0] for value in cameras))
+        camera = select(cameras, 0, 0)
         one = Reconstruction(
             view=view,
             neighbours=tuple(chosen),

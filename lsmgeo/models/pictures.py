@@ -1,0 +1,270 @@
+"""Pictures of voxels and of depth maps, shaded, without a window or a library that draws."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from lsmgeo._checks import check_number, check_whole, describe
+from lsmgeo.cameras import CameraTensors, as_tensors, orbit, rays
+from lsmgeo.errors import DTypeError, ShapeError
+
+__all__ = ["draw_depth", "draw_points", "draw_voxels", "tile"]
+
+BACKGROUND = 1.0
+COLOUR = (0.42, 0.60, 0.84)
+# Where light comes from, in the viewer's axes (x right, y down, z forward): the left, above, and behind.
+LIGHT = np.array([-0.45, -0.75, -0.6]) / np.linalg.norm([-0.45, -0.75, -0.6])
+AMBIENT = 0.35
+# Pixels of a side that one drawn pixel is the mean of.
+FINER = 2
+# Half the side of what is seen of the unit cube's world.
+REACH = 0.56
+ANGLES = ("azimuth", "elevation")
+# Between neighbouring pixels whose points are farther apart than this many of their widths there is no surface.
+STEEPEST = 10.0
+
+Floats = npt.NDArray[np.float64]
+Picture = npt.NDArray[np.uint8]
+
+
+def draw_voxels(
+    occupancy: Tensor | np.ndarray,
+    azimuth: float = 35.0,
+    elevation: float = 25.0,
+    size: int = 128,
+    *,
+    colour: Sequence[float] = COLOUR,
+    reach: float = REACH,
+) -> Picture:
+    """Draw the faces of occupied voxels as seen from far away.
+
+    They are shaded by a light at the viewer's left, and darker where voxels stand around them.
+
+    Convention:
+        The grid fills [-0.5, 0.5]^3 of the world, y up; azimuth and elevation as in `lsmgeo.cameras.orbit`.
+
+    Args:
+        occupancy: (D, H, W) bool.
+        azimuth: degrees, from where it is seen.
+        elevation: degrees in (-90, 90).
+        size: height and width of the picture in pixels.
+        colour: of the voxels, RGB in [0, 1].
+        reach: half the side of what is seen, world units.
+
+    Returns:
+        (size, size, 3) uint8 RGB on white.
+
+    Raises:
+        ShapeError: the grid is no (D, H, W).
+        DTypeError: it is not bool.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.models.pictures import draw_voxels
+        >>> cube = draw_voxels(torch.ones(4, 4, 4, dtype=torch.bool), 0.0, 0.0, 24, reach=1.0)
+        >>> cube.shape, int((cube < 255).all(-1).sum())  # half the side of 24
+        ((24, 24, 3), 144)
+    """
+    who = "draw_voxels"
+    grid = np.asarray(occupancy)
+    if grid.dtype != np.bool_:
+        raise DTypeError(f"{who}: occupancy must be bool (D, H, W); got {describe(occupancy)}")
+    if grid.ndim != 3 or 0 in grid.shape:
+        raise ShapeError(f"{who}: occupancy must be (D, H, W); got {grid.shape}")
+    size = check_whole(who, "size", size, 1, 4096)
+    view = _looking(who, azimuth, elevation)
+    quads, shades = _visible_faces(grid.transpose(2, 1, 0), view)
+    return _splat(quads, shades[:, None] * np.asarray(colour, np.float64), view, size, reach)
+
+
+def _looking(who: str, azimuth: float, elevation: float) -> Floats:
+    """The rows of the rotation of a viewer on a sphere about the origin."""
+    turn, tilt = (
+        check_number(who, name, value, "degrees") for name, value in zip(ANGLES, (azimuth, elevation), strict=True)
+    )
+    camera = orbit(torch.tensor(turn, dtype=torch.float64), tilt, 2.0, focal_length=1.0, height=1, width=1)
+    return np.asarray(camera.cam_from_world[:3, :3])
+
+
+def _visible_faces(grid: np.ndarray, view: Floats) -> tuple[Floats, npt.NDArray[np.float64]]:
+    """The faces (Q, 4, 3) of occupied voxels, indexed x, y, z, on the viewer's side, and how bright each is (Q,)."""
+    from scipy.ndimage import uniform_filter
+
+    counts = np.array(grid.shape)
+    padded = np.pad(grid, 3)
+    crowded = uniform_filter(padded.astype(np.float64), 5)
+    quads, shades = [], []
+    for axis in range(3):
+        side = -1 if view[2, axis] > 0 else 1
+        others = [other for other in range(3) if other != axis]
+        voxel = np.argwhere(grid & ~np.roll(padded, -side, axis)[3:-3, 3:-3, 3:-3])
+        corners = np.repeat(voxel[:, None].astype(np.float64), 4, 1)
+        corners[:, :, axis] += side > 0
+        corners[:, :, others] += np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
+        quads.append(corners / counts - 0.5)
+        before = voxel + 3
+        before[:, axis] += 2 * side
+        lit = AMBIENT + (1 - AMBIENT) * max(0.0, float(side * view[:, axis] @ LIGHT))
+        shades.append(lit * (1.12 - 0.9 * crowded[tuple(before.T)]))
+    return np.concatenate(quads), np.concatenate(shades)
+
+
+def draw_depth(
+    depth: Tensor,
+    camera: CameraTensors,
+    *,
+    turn: float = 25.0,
+    lift: float = 12.0,
+    size: int = 192,
+    colours: Tensor | None = None,
+    reach: float = REACH,
+) -> Picture:
+    """Draw a depth map as the shaded surface that it is, from a viewpoint beside its camera's.
+
+    Between pixels of one surface it is filled, over jumps of depth it is torn. Shading shows errors that colours by
+    depth hide (Kar et al. 2017, figure 4: "visualized with shading from a shifted viewpoint").
+
+    Args:
+        depth: (h, w) camera z, 0 where there is none.
+        camera: one camera, of any image size.
+        turn: degrees by which the viewer goes round the world's origin, to the camera's right.
+        lift: degrees by which they rise.
+        size: height and width of the picture in pixels.
+        colours: (3, h, w) RGB in [0, 1] of the surface; by default one colour.
+        reach: half the side of what is seen about the world's origin, world units.
+
+    Returns:
+        (size, size, 3) uint8 RGB on white.
+
+    Raises:
+        ShapeError, DTypeError: the depth is no floating (h, w).
+    """
+    who = "draw_depth"
+    if not isinstance(depth, Tensor) or not depth.is_floating_point():
+        raise DTypeError(f"{who}: depth must be a floating tensor (h, w); got {describe(depth)}")
+    if depth.dim() != 2 or min(depth.shape) < 2:
+        raise ShapeError(f"{who}: depth must be (h, w), each at least 2; got {tuple(depth.shape)}")
+    size = check_whole(who, "size", size, 1, 4096)
+    tensors = as_tensors(camera, who)
+    R = tensors.cam_from_world[:3, :3].double().cpu().numpy()
+    points, good, width = _world_points(depth.detach().cpu(), tensors, R)
+    corners = np.stack((points[:-1, :-1], points[:-1, 1:], points[1:, :-1], points[1:, 1:]), 2)
+    whole = good[:-1, :-1] & good[:-1, 1:] & good[1:, :-1] & good[1:, 1:]
+    sides = np.linalg.norm(corners - np.roll(corners, 1, 2), axis=-1).max(-1)
+    whole &= sides < STEEPEST * width
+    quads = corners[whole]  # (Q, 4, 3)
+    normals = np.cross(quads[:, 3] - quads[:, 0], quads[:, 1] - quads[:, 2])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    view = _shifted(R, turn, lift)
+    normals *= -np.sign(normals @ view[2])[:, None]  # towards the viewer
+    shade = AMBIENT + (1 - AMBIENT) * np.clip(normals @ view.T @ LIGHT, 0, 1)
+    if colours is None:
+        colour = np.broadcast_to(np.asarray(COLOUR), (len(quads), 3))
+    else:
+        image = colours.detach().cpu().double().permute(1, 2, 0).numpy()
+        colour = image[:-1, :-1][whole]
+    return _splat(quads, shade[:, None] * colour, view, size, reach)
+
+
+def _world_points(depth: Tensor, camera: CameraTensors, R: Floats) -> tuple[Floats, npt.NDArray[np.bool_], float]:
+    """The points (h, w, 3) of a depth map in the world, which there are, and how wide a pixel is at their depth."""
+    origin, directions = (value.double().cpu().numpy() for value in rays(camera, tuple(depth.shape)))  # type: ignore[arg-type]
+    z = depth.double().numpy()
+    good = np.isfinite(z) & (z > 0)
+    lattice = directions / (directions @ R[2])[..., None]  # at depth 1
+    width = float(np.linalg.norm(lattice[0, 1] - lattice[0, 0]) * (np.median(z[good]) if good.any() else 1.0))
+    return origin + lattice * np.where(good, z, 1.0)[..., None], good, width
+
+
+def _shifted(R: Floats, turn: float, lift: float) -> Floats:
+    """The rows of a viewer's rotation who went round the origin from a camera's place, to its right and upwards."""
+    a, e = np.radians(turn), np.radians(lift)
+    about_y = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    about_x = np.array([[1, 0, 0], [0, np.cos(e), -np.sin(e)], [0, np.sin(e), np.cos(e)]])
+    return np.asarray(about_x @ about_y @ R)
+
+
+def _splat(quads: Floats, colours: Floats, view: Floats, size: int, reach: float) -> Picture:
+    """Draw quads (Q, 4, 3), or points (Q, 1, 3), of one colour each, near over far, as seen from far away."""
+    fine = size * FINER
+    picture = np.full((fine * fine, 3), BACKGROUND)
+    if len(quads):
+        scale = fine / (2 * reach)
+        seen = _dots(quads, scale).reshape(-1, 3) @ view.T
+        column, row = (np.floor(seen[:, axis] * scale + fine / 2).astype(np.int64) for axis in (0, 1))
+        inside = (column >= 0) & (column < fine) & (row >= 0) & (row < fine)
+        order = np.flatnonzero(inside)[np.argsort(-seen[inside, 2], kind="stable")]
+        picture[row[order] * fine + column[order]] = colours[order // (len(seen) // len(quads))]
+    return _averaged(picture.reshape(fine, fine, 3))
+
+
+def _dots(quads: Floats, scale: float) -> Floats:
+    """Dots (Q, N, 3) of quads, so dense that nothing shows between them at so many pixels a unit; of points around."""
+    if quads.shape[1] == 1:
+        half = 0.5 / scale
+        offsets = np.stack(np.meshgrid(*[(-half, half)] * 3, indexing="ij"), -1).reshape(-1, 3)
+        return quads + offsets
+    widest = float(np.linalg.norm(quads - np.roll(quads, 1, 1), axis=-1).max())
+    number = int(np.clip(np.ceil(1.5 * scale * widest), 2, 24))
+    s, t = (axis.reshape(-1) for axis in np.meshgrid(*[np.linspace(0, 1, number)] * 2))
+    return np.asarray(np.stack(((1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t), 1) @ quads)
+
+
+def draw_points(
+    points: np.ndarray,
+    colours: np.ndarray,
+    azimuth: float = 35.0,
+    elevation: float = 25.0,
+    size: int = 192,
+    *,
+    reach: float = REACH,
+) -> Picture:
+    """Draw coloured points of the world as small squares, near ones over far ones, as seen from far away.
+
+    Args:
+        points: (N, 3).
+        colours: (N, 3) uint8.
+        azimuth: degrees, see `draw_voxels`.
+        elevation: degrees in (-90, 90).
+        size: height and width of the picture in pixels.
+        reach: half the side of what is seen, world units.
+
+    Returns:
+        (size, size, 3) uint8 RGB on white.
+    """
+    places = np.asarray(points, np.float64).reshape(-1, 1, 3)
+    return _splat(places, np.asarray(colours) / 255.0, _looking("draw_points", azimuth, elevation), size, reach)
+
+
+def tile(pictures: Sequence[Sequence[Picture | None]], gap: int = 4) -> Picture:
+    """Rows of pictures of one size as one, white between them and in the place of those that are None.
+
+    Args:
+        pictures: rows, which may differ in length.
+        gap: pixels between two.
+
+    Returns:
+        (h, w, 3) uint8.
+    """
+    first = next(picture for row in pictures for picture in row if picture is not None)
+    height, width, _ = first.shape
+    columns = max(len(row) for row in pictures)
+    sheet = np.full((len(pictures) * (height + gap) - gap, columns * (width + gap) - gap, 3), 255, np.uint8)
+    for y, row in enumerate(pictures):
+        for x, picture in enumerate(row):
+            if picture is not None:
+                top, left = y * (height + gap), x * (width + gap)
+                sheet[top : top + height, left : left + width] = picture
+    return sheet
+
+
+def _averaged(fine: Floats) -> Picture:
+    """(h, w, 3) in [0, 1] as bytes, each the mean of a square."""
+    height, width, _ = fine.shape
+    small = fine.reshape(height // FINER, FINER, width // FINER, FINER, 3).mean((1, 3))
+    return np.asarray((small.clip(0, 1) * 255).round(), np.uint8)

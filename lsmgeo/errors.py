@@ -7,6 +7,7 @@ from os import PathLike
 __all__ = [
     "BackendError",
     "CameraError",
+    "CheckpointError",
     "DTypeError",
     "DataError",
     "DeviceError",
@@ -14,6 +15,7 @@ __all__ = [
     "LsmGeoError",
     "OptionError",
     "ShapeError",
+    "TrainingError",
 ]
 
 
@@ -49,7 +51,18 @@ class BackendError(LsmGeoError, ValueError):
     """A backend was asked for by name and cannot run this call."""
 
 
-class DataError(LsmGeoError, OSError):
+class _FileError(LsmGeoError):
+    def __init__(self, path: str | PathLike[str], reason: str) -> None:
+        super().__init__(f"{path}: {reason}")
+        self.path = path
+        self.reason = reason
+
+    def __reduce__(self) -> tuple[type[_FileError], tuple[str | PathLike[str], str]]:
+        # The default rebuilds an error from its one message, and a pool of processes that meets this breaks.
+        return type(self), (self.path, self.reason)
+
+
+class DataError(_FileError, OSError):
     """A file from outside cannot be used.
 
     Args:
@@ -57,11 +70,15 @@ class DataError(LsmGeoError, OSError):
         reason: what is wrong with it.
     """
 
-    def __init__(self, path: str | PathLike[str], reason: str) -> None:
-        super().__init__(f"{path}: {reason}")
-        self.path = path
-        self.reason = reason
 
-    def __reduce__(self) -> tuple[type[DataError], tuple[str | PathLike[str], str]]:
-        # The default rebuilds an error from its one message, and a pool of processes that meets this breaks.
-        return type(self), (self.path, self.reason)
+class CheckpointError(_FileError, RuntimeError):
+    """A checkpoint or a file of weights cannot be written, read, or used for this model or run.
+
+    Args:
+        path: the file or folder.
+        reason: what is wrong with it.
+    """
+
+
+class TrainingError(LsmGeoError, RuntimeError):
+    """Training cannot go on: its numbers are not finite, or its processes do not agree."""

@@ -36,8 +36,8 @@ INVENTORY = {
         "depth_errors", "median_depth_error", "point_cloud_scores", "voxel_iou",
     },
     errors: {
-        "BackendError", "CameraError", "DTypeError", "DataError", "DeviceError", "GridError", "LsmGeoError",
-        "OptionError", "ShapeError",
+        "BackendError", "CameraError", "CheckpointError", "DTypeError", "DataError", "DeviceError", "GridError",
+        "LsmGeoError", "OptionError", "ShapeError", "TrainingError",
     },
 }  # fmt: skip
 
@@ -129,6 +129,7 @@ def test_errors_are_also_built_in_errors():
     kinds = {
         "ShapeError": ValueError, "DTypeError": TypeError, "DeviceError": ValueError, "CameraError": ValueError,
         "GridError": ValueError, "OptionError": ValueError, "BackendError": ValueError, "DataError": OSError,
+        "CheckpointError": RuntimeError, "TrainingError": RuntimeError,
     }  # fmt: skip
     for name, kind in kinds.items():
         assert issubclass(getattr(errors, name), kind)

@@ -1,0 +1,1 @@
+"""Training that loses no work."""

@@ -1,0 +1,63 @@
+"""What the processes of one run must agree on; with a single process every answer is its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TypeVar
+
+import torch
+from torch import distributed
+
+from lsmgeo.errors import TrainingError
+
+__all__ = ["any_true", "check_agreement", "gather"]
+
+Value = TypeVar("Value")
+
+
+def any_true(flag: bool) -> bool:
+    """Whether the flag is true in any process. All processes must call this together.
+
+    Args:
+        flag: this process's.
+    """
+    if not _is_distributed():
+        return flag
+    # NCCL moves no memory of the host.
+    device = torch.device("cuda", torch.cuda.current_device()) if distributed.get_backend() == "nccl" else "cpu"
+    reduced = torch.tensor([int(flag)], dtype=torch.int32, device=device)
+    distributed.all_reduce(reduced, distributed.ReduceOp.MAX)
+    return bool(reduced.item())
+
+
+def gather(value: Value) -> list[Value]:
+    """The values of all processes in the order of their ranks. All processes must call this together.
+
+    Args:
+        value: this process's: numbers, strings, tensors and containers of them.
+    """
+    if not _is_distributed():
+        return [value]
+    values: list[Value | None] = [None] * distributed.get_world_size()
+    distributed.all_gather_object(values, value)
+    return values  # type: ignore[return-value]
+
+
+def check_agreement(things: Mapping[str, object]) -> None:
+    """Refuse to train where processes start from different things.
+
+    Args:
+        things: what must be the same everywhere, by name: the configuration, checksums of parameters and of data.
+
+    Raises:
+        TrainingError: a thing differs; the message names it and the first process that differs.
+    """
+    for rank, others in enumerate(gather(dict(things))):
+        for name in sorted(things.keys() | others.keys()):
+            if things.get(name) != others.get(name):
+                own, other = things.get(name), others.get(name)
+                raise TrainingError(f"processes do not agree: {name} is {own!r} here and {other!r} in process {rank}")
+
+
+def _is_distributed() -> bool:
+    return distributed.is_available() and distributed.is_initialized()

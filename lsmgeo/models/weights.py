@@ -1,0 +1,306 @@
+"""Weights of models in one file: safetensors, with the settings that the model is made from, and a checksum.
+
+Nothing in such a file is believed before it was checked: its header is bounded, and names, shapes, dtypes and count of
+its tensors are compared with those of the model that the settings describe before that model is allocated.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor, nn
+
+from lsmgeo.data.files import read_bytes, write_atomic
+from lsmgeo.errors import CheckpointError, DataError, LsmGeoError, OptionError
+from lsmgeo.models.creating import from_settings, settings_of
+from lsmgeo.models.run_folders import WEIGHTS, checkpoint_folders
+
+__all__ = [
+    "Weights",
+    "encode_weights",
+    "fill_model",
+    "load",
+    "parse_weights",
+    "read_file",
+    "read_weights",
+    "write_weights",
+]
+
+FORMAT = "lsmgeo-weights-1"
+MAX_FILE_BYTES = 1 << 34
+MAX_HEADER_BYTES = 1 << 22
+MAX_TENSORS = 10_000
+DTYPES = {
+    "F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16, "I64": torch.int64,
+    "I32": torch.int32, "U8": torch.uint8, "BOOL": torch.bool,
+}  # fmt: skip
+NAMES = {dtype: name for name, dtype in DTYPES.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """What a file of weights holds.
+
+    Args:
+        path: the file.
+        settings: what the model is made from.
+        about: notes of whoever wrote the file.
+        tensors: by the names of the model's ``state_dict``.
+    """
+
+    path: Path
+    settings: Mapping[str, Any]
+    about: Mapping[str, Any]
+    tensors: Mapping[str, Tensor]
+
+
+def write_weights(path: str | os.PathLike[str], model: nn.Module, *, about: Mapping[str, Any] | None = None) -> Path:
+    """Write a model to one file that `load` makes the model from, atomically.
+
+    Args:
+        path: the file, by custom ``.safetensors``.
+        model: from `create`.
+        about: notes to keep with the weights, in types that JSON has.
+
+    Returns:
+        The path written.
+
+    Raises:
+        CheckpointError: the file cannot be written; nothing half-written stays.
+        OptionError: notes that JSON cannot hold.
+
+    Example:
+        >>> import tempfile
+        >>> from lsmgeo.models import create
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = write_weights(f"{folder}/model.safetensors", create("voxel-lsm", preset="tiny"))
+        ...     load(path).name
+        'voxel-lsm'
+    """
+    try:
+        return write_atomic(path, encode_weights(model, about=about))
+    except DataError as error:
+        raise CheckpointError(path, error.reason) from error
+
+
+def load(path: str | os.PathLike[str]) -> nn.Module:
+    """Make a model from its weights.
+
+    Args:
+        path: as for `read_weights`.
+
+    Returns:
+        The model, on the CPU, in evaluation mode.
+
+    Raises:
+        CheckpointError: there is no such file, it is damaged, or it does not hold what its settings describe.
+    """
+    weights = read_weights(path)
+    # Without memory first: settings that a file does not live up to must not allocate what they describe.
+    with torch.device("meta"):
+        plan = _make(weights)
+    _check_fit(plan, weights)
+    with torch.random.fork_rng(devices=[]):
+        model = _make(weights)
+    fill_model(model, weights)
+    return model.eval()
+
+
+def read_weights(path: str | os.PathLike[str]) -> Weights:
+    """Read and verify weights without making the model.
+
+    Args:
+        path: a file of `write_weights`; a checkpoint; or a run folder, for its newest checkpoint whose weights verify.
+            If that is not the newest that is there, a warning names both.
+
+    Returns:
+        Settings, notes and tensors.
+
+    Raises:
+        CheckpointError: there is no such file, or it is damaged.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return _read(path)
+    if (path / WEIGHTS).is_file():
+        return _read(path / WEIGHTS)
+    damaged: list[CheckpointError] = []
+    for folder in checkpoint_folders(path).values():
+        try:
+            weights = _read(folder / WEIGHTS)
+        except CheckpointError as error:
+            damaged.append(error)
+            continue
+        if damaged:
+            warnings.warn(f"damaged: {'; '.join(map(str, damaged))}. Going back to {folder}", stacklevel=2)
+        return weights
+    if damaged:
+        raise CheckpointError(path, f"no checkpoint verifies; the newest: {damaged[0]}")
+    raise CheckpointError(path, f"holds neither {WEIGHTS} nor a checkpoint")
+
+
+def encode_weights(model: nn.Module, *, about: Mapping[str, Any] | None = None) -> bytes:
+    """The bytes of a file of weights.
+
+    Args:
+        model: from `create`.
+        about: notes to keep with the weights, in types that JSON has.
+
+    Returns:
+        The content of a safetensors file.
+
+    Raises:
+        OptionError: notes that JSON cannot hold.
+    """
+    tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in model.state_dict().items()}
+    try:
+        notes = {name: json.dumps(value, allow_nan=False) for name, value in (("about", dict(about or {})),)}
+    except (TypeError, ValueError) as error:
+        raise OptionError(f"write_weights: about must consist of what JSON has; {error}") from error
+    metadata = {"format": FORMAT, "settings": json.dumps(settings_of(model)), **notes}
+    metadata["sha256"] = _checksum(metadata, tensors)
+    return safetensors.torch.save(tensors, metadata)
+
+
+def parse_weights(content: bytes, path: Path) -> Weights:
+    """Read the bytes of a file of weights.
+
+    Args:
+        content: the whole file.
+        path: where it came from, for messages.
+
+    Returns:
+        Settings, notes and tensors.
+
+    Raises:
+        CheckpointError: it is no such file, or damaged.
+    """
+    metadata = _check_header(content, path)
+    try:
+        tensors = safetensors.torch.load(content)
+        settings, about = json.loads(metadata["settings"]), json.loads(metadata["about"])
+    except (safetensors.SafetensorError, ValueError, KeyError, RecursionError) as error:
+        raise CheckpointError(path, f"is damaged ({str(error)[:200]})") from error
+    found = metadata.pop("sha256", None)
+    if found != _checksum(metadata, tensors):
+        raise CheckpointError(path, "is damaged: its SHA-256 is not the one that was saved")
+    if not isinstance(settings, dict) or not isinstance(about, dict):
+        raise CheckpointError(path, "holds settings that are none")
+    return Weights(path, settings, about, tensors)
+
+
+def read_file(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
+    """The bytes of a plain file.
+
+    Args:
+        path: the file.
+        limit: the largest size accepted.
+
+    Returns:
+        All of them.
+
+    Raises:
+        CheckpointError: it is missing, no plain file, unreadable, or too large.
+    """
+    try:
+        # Reading up to a limit takes memory for all of it.
+        return read_bytes(path, min(limit, path.stat().st_size) if path.is_file() else limit)
+    except DataError as error:
+        raise CheckpointError(path, error.reason) from error
+    except OSError as error:
+        raise CheckpointError(path, f"cannot be read ({error})") from error
+
+
+def fill_model(model: nn.Module, weights: Weights) -> None:
+    """Copy tensors into a model.
+
+    Args:
+        model: to be filled.
+        weights: from `read_weights`.
+
+    Raises:
+        CheckpointError: a tensor is missing, too many, or of another shape or dtype; the message names it.
+    """
+    _check_fit(model, weights)
+    model.load_state_dict(dict(weights.tensors))
+
+
+def _read(path: Path) -> Weights:
+    return parse_weights(read_file(path), path)
+
+
+def _make(weights: Weights) -> nn.Module:
+    try:
+        return from_settings(dict(weights.settings))
+    except (LsmGeoError, TypeError, ValueError, KeyError, RuntimeError) as error:
+        raise CheckpointError(weights.path, f"holds settings of no model ({str(error)[:400]})") from error
+
+
+def _check_fit(model: nn.Module, weights: Weights) -> None:
+    expected = model.state_dict()
+    for name in sorted(expected.keys() | weights.tensors.keys()):
+        if name not in weights.tensors:
+            raise CheckpointError(weights.path, f"lacks {name}, {_describe(expected[name])}")
+        if name not in expected:
+            raise CheckpointError(weights.path, f"holds {name}, which the model has not")
+        want, have = _describe(expected[name]), _describe(weights.tensors[name])
+        if want != have:
+            raise CheckpointError(weights.path, f"holds {name} as {have}; the model has {want}")
+
+
+def _describe(tensor: Tensor) -> str:
+    return f"{tuple(tensor.shape)} {str(tensor.dtype).removeprefix('torch.')}"
+
+
+def _checksum(metadata: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
+    digest = hashlib.sha256(json.dumps(dict(metadata), sort_keys=True).encode())
+    for name, tensor in sorted(tensors.items()):
+        digest.update(json.dumps([name, NAMES[tensor.dtype], list(tensor.shape)]).encode())
+        # Reinterpreted as bytes: numpy has no bfloat16.
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _check_header(content: bytes, path: Path) -> dict[str, str]:
+    """The metadata, once the header is bounded and every tensor lies where its shape says, one after the other."""
+    length = int.from_bytes(content[:8], "little")
+    if len(content) < 8 or length > min(len(content) - 8, MAX_HEADER_BYTES):
+        raise CheckpointError(path, "is not a whole file of weights (safetensors)")
+    try:
+        header = json.loads(content[8 : 8 + length])
+        metadata = header.pop("__metadata__")
+        if metadata["format"] != FORMAT:
+            raise CheckpointError(path, f"is of format {metadata['format'][:64]!r}; this version reads {FORMAT!r}")
+        if len(header) > MAX_TENSORS:
+            raise CheckpointError(path, f"holds {len(header)} tensors, the limit is {MAX_TENSORS}")
+        end = 0
+        for begin, stop, size in sorted(_extent(entry) for entry in header.values()):
+            if begin != end or stop != begin + size:
+                raise ValueError("tensors overlap or leave gaps")
+            end = stop
+        if end != len(content) - 8 - length:
+            raise ValueError("tensors do not fill the file")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise CheckpointError(path, f"is not a file of weights ({str(error)[:200]})") from error
+    if not all(isinstance(value, str) for value in metadata.values()):
+        raise CheckpointError(path, "is not a file of weights (its metadata is no text)")
+    return metadata
+
+
+def _extent(entry: Mapping[str, Any]) -> tuple[int, int, int]:
+    shape, (begin, stop) = entry["shape"], entry["data_offsets"]
+    numbers = [*shape, begin, stop]
+    if len(shape) > 8 or not all(isinstance(number, int) and 0 <= number < 1 << 40 for number in numbers):
+        raise ValueError("a shape or an offset is none")
+    return begin, stop, math.prod(shape) * DTYPES[entry["dtype"]].itemsize

@@ -10,11 +10,20 @@ __all__ = ["CHECKPOINTS", "WEIGHTS", "checkpoint_folders", "step_folder"]
 CHECKPOINTS = "checkpoints"
 WEIGHTS = "model.safetensors"
 
-_STEP = re.compile(r"step_(\d{8,18})")
+# ".old": a checkpoint that was about to be replaced when the process was killed.
+_STEP = re.compile(r"step_(\d{8,18})(\.old-\d+)?")
 
 
 def step_folder(step: int) -> str:
-    """The name of a step's checkpoint."""
+    """The name of a step's checkpoint.
+
+    Args:
+        step: its number.
+
+    Example:
+        >>> step_folder(100)
+        'step_00000100'
+    """
     return f"step_{step:08d}"
 
 
@@ -27,5 +36,10 @@ def checkpoint_folders(path: Path) -> dict[int, Path]:
     folder = path / CHECKPOINTS if (path / CHECKPOINTS).is_dir() else path
     if not folder.is_dir():
         return {}
-    named = {item: _STEP.fullmatch(item.name) for item in folder.iterdir() if item.is_dir()}
-    return dict(sorted(((int(match[1]), item) for item, match in named.items() if match), reverse=True))
+    found: dict[int, Path] = {}
+    # The longer names first: a checkpoint wins over the one that it replaces.
+    for item in sorted(folder.iterdir(), key=lambda item: -len(item.name)):
+        match = _STEP.fullmatch(item.name)
+        if match and item.is_dir():
+            found[int(match[1])] = item
+    return dict(sorted(found.items(), reverse=True))

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from lsmgeo.data.files import read_bytes, write_atomic
 from lsmgeo.errors import CheckpointError, DataError, LsmGeoError, OptionError
 from lsmgeo.models.creating import from_settings, settings_of
+from lsmgeo.models.model import Model
 from lsmgeo.models.run_folders import WEIGHTS, checkpoint_folders
 
 __all__ = [
@@ -94,7 +95,7 @@ def write_weights(path: str | os.PathLike[str], model: nn.Module, *, about: Mapp
         raise CheckpointError(path, error.reason) from error
 
 
-def load(path: str | os.PathLike[str]) -> nn.Module:
+def load(path: str | os.PathLike[str]) -> Model:
     """Make a model from its weights.
 
     Args:
@@ -240,7 +241,7 @@ def _read(path: Path) -> Weights:
     return parse_weights(read_file(path), path)
 
 
-def _make(weights: Weights) -> nn.Module:
+def _make(weights: Weights) -> Model:
     try:
         return from_settings(dict(weights.settings))
     except (LsmGeoError, TypeError, ValueError, KeyError, RuntimeError) as error:

@@ -7,13 +7,11 @@ and SHA-256 of the files and of itself; what does not match is not read.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import io
 import json
 import os
 import re
-import shutil
 import time
 import warnings
 from collections.abc import Collection, Iterator, Mapping
@@ -27,20 +25,18 @@ from torch import Tensor, nn
 import lsmgeo
 from lsmgeo._checks import check_whole
 from lsmgeo.errors import CheckpointError, OptionError
-from lsmgeo.models.run_folders import WEIGHTS, checkpoint_folders, step_folder
+from lsmgeo.models.run_folders import CHECKPOINTS, WEIGHTS, checkpoint_folders, step_folder
+from lsmgeo.models.training.durable import clear_leftovers, make_folder, put_file, put_folder, remove_folder
 from lsmgeo.models.training.revision import code_revision
 from lsmgeo.models.weights import Weights, encode_weights, fill_model, parse_weights, read_file
 
-__all__ = ["Checkpoint", "check_config", "clear_leftovers", "load_checkpoint", "load_latest", "save_checkpoint"]
+__all__ = ["Checkpoint", "check_config", "load_checkpoint", "load_latest", "save_checkpoint"]
 
 FORMAT = 1
 LATEST = "LATEST"
 META = "meta.json"
 STATE = "state.pt"
 MAX_META_BYTES = 1 << 24
-
-# A folder or file on its way in (tmp) or out (old), and the process that it belongs to.
-_LEFTOVER = re.compile(r"(?P<name>step_\d{8,18}|LATEST)\.(?P<kind>tmp|old)-\d+")
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +85,8 @@ class Checkpoint:
         """
         state = self.part(name)
         try:
-            if isinstance(target, torch.optim.Optimizer):
-                _check_moments(target, state)
+            if hasattr(target, "param_groups"):
+                _check_moments(target.param_groups, state)
             target.load_state_dict(state)
         except (KeyError, ValueError, TypeError, IndexError, AttributeError, RuntimeError) as error:
             reason = f"missing key {error}" if isinstance(error, KeyError) else str(error)
@@ -135,36 +131,31 @@ def save_checkpoint(
     Raises:
         CheckpointError: it cannot be written: the disk is full, the folder is read-only, and the like. The checkpoints
             from before are as they were and nothing half-written stays.
+        OptionError: the state or the configuration holds what a checkpoint cannot.
     """
-    folder, keep, step = (
-        Path(folder),
-        check_whole("save_checkpoint", "keep", keep, 1),
-        check_whole("save_checkpoint", "step", step, 0),
-    )
-    buffer = io.BytesIO()
-    torch.save(dict(state), buffer)
-    files = {WEIGHTS: encode_weights(model, about={"step": step, "training": dict(config)}), STATE: buffer.getvalue()}
-    files[META] = _encode_meta(files, step, config, best)
+    folder = Path(folder)
+    step, keep = check_whole("save_checkpoint", "step", step, 0), check_whole("save_checkpoint", "keep", keep, 1)
     final = folder / step_folder(step)
-    temporary = folder / f"{final.name}.tmp-{os.getpid()}"
+    files = {
+        WEIGHTS: encode_weights(model, about={"step": step, "training": dict(config)}),
+        STATE: _encode_state(state),
+    }
+    files[META] = _encode_meta(files, step, config, best)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         clear_leftovers(folder)
-        os.mkdir(temporary)
-        for name, content in files.items():
-            _write(temporary / name, content)
-        _sync(temporary)
-        _take_place(temporary, final)
-        _sync(folder)
+        put_folder(final, files)
     except OSError as error:
-        shutil.rmtree(temporary, ignore_errors=True)
         raise CheckpointError(final, f"cannot be written ({error})") from error
-    # From here on the checkpoint stands, and whatever fails is repaired by the next one.
+    # From here on the checkpoint stands, and the next one makes up for what fails.
     try:
-        _write_latest(folder, final.name)
-        _prune(folder, step, keep, best)
+        put_file(folder / LATEST, f"{final.name}\n".encode())
+        # Those of later steps are damaged, or this run would have begun with them; they go when it reaches their steps.
+        for number in [number for number in checkpoint_folders(folder) if number <= step][keep:]:
+            if number != best:
+                remove_folder(folder / step_folder(number))
     except OSError as error:
-        warnings.warn(f"{folder}: {final.name} is saved; tidying up failed ({error})", stacklevel=2)
+        warnings.warn(f"{final} is saved; tidying up after it failed ({error})", stacklevel=2)
     return final
 
 
@@ -175,11 +166,14 @@ def load_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
         path: a checkpoint; or a run folder or its folder of checkpoints, for the newest one that verifies. If that is
             not the newest that is there, a warning names both.
 
+    Returns:
+        The checkpoint.
+
     Raises:
         CheckpointError: there is none, all are damaged, or it is of a newer format.
     """
     path = Path(path)
-    if (path / META).is_file() and not checkpoint_folders(path):
+    if (path / META).is_file():
         return _read(path)
     checkpoint = load_latest(path)
     if checkpoint is None:
@@ -201,25 +195,24 @@ def load_latest(path: str | os.PathLike[str]) -> Checkpoint | None:
     """
     path = Path(path)
     folders = checkpoint_folders(path)
-    damaged: list[CheckpointError] = []
+    problems = []
+    if missing := _missing(path / CHECKPOINTS if (path / CHECKPOINTS).is_dir() else path, max(folders, default=-1)):
+        problems.append(f"{missing}: is missing, and {LATEST} names it")
     for step, folder in folders.items():
         try:
             checkpoint = _read(folder)
             if checkpoint.step != step:
-                raise CheckpointError(folder, f"is the checkpoint of step {checkpoint.step}, by its {META}")
+                raise CheckpointError(folder, f"is the checkpoint of step {checkpoint.step}, as its {META} says")
         except _NewerFormatError:
             raise
         except CheckpointError as error:
-            damaged.append(error)
+            problems.append(str(error))
             continue
-        if damaged:
-            reasons = "; ".join(map(str, damaged))
-            warnings.warn(f"damaged: {reasons}. Going back to {folder}", stacklevel=2)
-        else:
-            _warn_of_missing(folder)
+        if problems:
+            warnings.warn(f"{'; '.join(problems)}. Going back to {folder}", stacklevel=2)
         return checkpoint
-    if damaged:
-        raise CheckpointError(path, f"no checkpoint verifies; the newest: {damaged[0]}")
+    if problems:
+        raise CheckpointError(path, f"no checkpoint verifies: {'; '.join(problems)}")
     return None
 
 
@@ -234,40 +227,30 @@ def check_config(checkpoint: Checkpoint, config: Mapping[str, Any], *, free: Col
     Raises:
         CheckpointError: another value is different, missing or new; the message names the first.
     """
-    # What JSON makes of it (lists of tuples, strings of keys) is what the checkpoint holds.
-    before, now = _flatten(checkpoint.config), _flatten(json.loads(_canonical(config)))
+    # What JSON makes of it (lists of tuples) is what the checkpoint holds.
+    before, now = dict(_leaves(checkpoint.config)), dict(_leaves(json.loads(_canonical(config))))
     for key in sorted(before.keys() | now.keys()):
         if any(key == name or key.startswith(name + ".") for name in free):
             continue
-        was, there = before.get(key, "missing"), now.get(key, "missing")
-        if was != there:
-            raise CheckpointError(checkpoint.path, f"belongs to another run: {key} is {was!r} there and {there!r} here")
-
-
-def clear_leftovers(folder: str | os.PathLike[str]) -> None:
-    """Remove what a killed process left half-written. Only the run that owns the folder may do this.
-
-    Args:
-        folder: the run's folder of checkpoints; it need not exist.
-    """
-    folder = Path(folder)
-    if not folder.is_dir():
-        return
-    for item in sorted(folder.iterdir()):
-        match = _LEFTOVER.fullmatch(item.name)
-        if match is None:
-            continue
-        if match["kind"] == "old" and not (folder / match["name"]).exists():
-            # Killed between the two renames of `_take_place`.
-            os.rename(item, folder / match["name"])
-        elif item.is_dir():
-            shutil.rmtree(item, ignore_errors=True)
-        else:
-            item.unlink(missing_ok=True)
+        was, is_now = before.get(key, "missing"), now.get(key, "missing")
+        if was != is_now:
+            raise CheckpointError(checkpoint.path, f"belongs to another run: {key} was {was!r} and is {is_now!r} now")
 
 
 class _NewerFormatError(CheckpointError):
     """No damage: falling back would throw a newer version's work away."""
+
+
+def _encode_state(state: Mapping[str, Any]) -> bytes:
+    buffer = io.BytesIO()
+    torch.save(dict(state), buffer)
+    try:
+        # What cannot be read back is to be found out now, and not after the power failed.
+        torch.load(io.BytesIO(buffer.getvalue()), weights_only=True)
+    except Exception as error:
+        reason = str(error)[:400]
+        raise OptionError(f"save_checkpoint: state must consist of numbers, text and tensors; {reason}") from error
+    return buffer.getvalue()
 
 
 def _encode_meta(files: Mapping[str, bytes], step: int, config: Mapping[str, Any], best: int | None) -> bytes:
@@ -296,67 +279,15 @@ def _canonical(value: Mapping[str, Any]) -> str:
         raise OptionError(f"save_checkpoint: config must consist of what JSON has; {error}") from error
 
 
-def _write(path: Path, content: bytes) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-    try:
-        rest = memoryview(content)
-        while rest:
-            rest = rest[os.write(descriptor, rest) :]
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _sync(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _take_place(temporary: Path, final: Path) -> None:
-    if final.exists():
-        # A folder cannot replace a full one in one step; `clear_leftovers` takes the old one back if the second fails.
-        old = final.with_name(f"{final.name}.old-{os.getpid()}")
-        os.rename(final, old)
-        try:
-            os.rename(temporary, final)
-        except OSError:
-            os.rename(old, final)
-            raise
-        shutil.rmtree(old, ignore_errors=True)
-    else:
-        os.rename(temporary, final)
-
-
-def _write_latest(folder: Path, name: str) -> None:
-    temporary = folder / f"{LATEST}.tmp-{os.getpid()}"
-    try:
-        _write(temporary, f"{name}\n".encode())
-        os.rename(temporary, folder / LATEST)
-    except OSError:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
-    _sync(folder)
-
-
-def _prune(folder: Path, step: int, keep: int, best: int | None) -> None:
-    # Those of later steps are damaged, or this run would have resumed from them; they go when it reaches their steps.
-    older = [path for number, path in checkpoint_folders(folder).items() if number <= step and number != best]
-    for path in older[keep - (best == step) :]:
-        # Renamed first: half a checkpoint must not look like a damaged one.
-        leftover = path.with_name(f"{path.name}.tmp-{os.getpid()}")
-        os.rename(path, leftover)
-        shutil.rmtree(leftover)
-
-
 def _read(folder: Path) -> Checkpoint:
     meta = _read_meta(folder / META)
     contents = {}
-    for name in (WEIGHTS, STATE):
-        size, digest = meta["files"][name]["bytes"], meta["files"][name]["sha256"]
+    try:
+        entries = [(name, meta["files"][name]["bytes"], meta["files"][name]["sha256"]) for name in (WEIGHTS, STATE)]
+        step, config, best = meta["step"], meta["config"], meta["best"]
+    except (KeyError, TypeError) as error:
+        raise CheckpointError(folder / META, f"lacks what a checkpoint needs ({error})") from error
+    for name, size, digest in entries:
         contents[name] = content = read_file(folder / name)
         if len(content) != size:
             raise CheckpointError(folder / name, f"has {len(content)} bytes instead of {size}")
@@ -369,7 +300,7 @@ def _read(folder: Path) -> Checkpoint:
         raise CheckpointError(folder / STATE, f"cannot be read ({str(error)[:400]})") from error
     if not isinstance(state, dict):
         raise CheckpointError(folder / STATE, f"holds no state but {type(state).__name__}")
-    return Checkpoint(folder, meta["step"], meta["config"], meta["best"], weights, state)
+    return Checkpoint(folder, step, config, best, weights, state)
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
@@ -380,7 +311,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
             raise ValueError("no object")
         found = meta.pop("sha256", None)
         is_whole = found == hashlib.sha256(_canonical(meta).encode()).hexdigest()
-    except (ValueError, RecursionError, OptionError) as error:
+    except (ValueError, RecursionError) as error:
         raise CheckpointError(path, f"is damaged ({str(error)[:200]})") from error
     version = meta.get("format")
     if isinstance(version, int) and version > FORMAT and (is_whole or found is None):
@@ -391,31 +322,26 @@ def _read_meta(path: Path) -> dict[str, Any]:
     return meta
 
 
-def _warn_of_missing(newest: Path) -> None:
-    """Say when the pointer names a later checkpoint than there is."""
+def _missing(folder: Path, newest: int) -> Path | None:
+    """The checkpoint that the pointer in a folder names, if it is later than the newest one there."""
     try:
-        named = read_file(newest.parent / LATEST, 64).decode("ascii").strip()
+        named = read_file(folder / LATEST, 64).decode("ascii").strip()
     except (CheckpointError, UnicodeDecodeError):
-        return
-    if re.fullmatch(r"step_\d{8,18}", named) and int(named[5:]) > int(newest.name[5:]):
-        warnings.warn(f"missing: {newest.with_name(named)}, which {LATEST} names. Going back to {newest}", stacklevel=3)
+        return None
+    is_later = re.fullmatch(r"step_\d{8,18}", named) and int(named.removeprefix("step_")) > newest
+    return folder / named if is_later else None
 
 
-def _check_moments(optimiser: torch.optim.Optimizer, state: Mapping[str, Any]) -> None:
-    """``load_state_dict`` of optimisers takes moments of any shape."""
-    parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
+def _check_moments(groups: list[dict[str, Any]], state: Mapping[str, Any]) -> None:
+    """Refuse moments of another shape than their parameter, which ``load_state_dict`` of optimisers takes."""
+    shapes = [tuple(parameter.shape) for group in groups for parameter in group["params"]]
     for index, moments in state["state"].items():
         for name, moment in moments.items():
-            shape = tuple(parameters[index].shape)
-            if isinstance(moment, Tensor) and moment.dim() and tuple(moment.shape) != shape:
-                raise ValueError(f"{name} of parameter {index} is {tuple(moment.shape)}, the parameter {shape}")
+            if isinstance(moment, Tensor) and moment.dim() and tuple(moment.shape) != shapes[index]:
+                raise ValueError(f"{name} of parameter {index} is {tuple(moment.shape)}, the parameter {shapes[index]}")
 
 
-def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    return dict(_leaves(values, prefix))
-
-
-def _leaves(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for key, value in values.items():
         if isinstance(value, Mapping):
             yield from _leaves(value, f"{prefix}{key}.")

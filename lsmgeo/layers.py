@@ -197,8 +197,9 @@ class PlaneSweepProject(nn.Module):
         *,
         grid: VoxelGrid | None = None,
         depths: Tensor | None = None,
+        size: tuple[int, int] | None = None,
     ) -> Projected:
-        """Sweep a volume (B, C, D, H, W); `grid` and `depths` take the place of the layer's."""
+        """Sweep a volume (B, C, D, H, W); `grid`, `depths` and `size` take the place of the layer's."""
         grid = self.grid if grid is None else grid
         if grid is None:
             raise GridError("PlaneSweepProject: grid must be given to the layer or to the call; got None")
@@ -212,7 +213,7 @@ class PlaneSweepProject(nn.Module):
             cameras,
             grid,
             depths,
-            self.size,
+            self.size if size is None else size,
             view_mask=view_mask,
             mode=self.mode,
             padding_mode=self.padding_mode,

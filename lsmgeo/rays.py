@@ -372,8 +372,15 @@ class ProjectReduce(nn.Module):
         self.weight = convolution.weight
         self.bias = convolution.bias
 
-    def forward(self, volume: Tensor, cameras: Cameras, view_mask: Tensor | None = None) -> Projected:
-        """Sweep and reduce a volume (B, C, D, H, W)."""
+    def forward(
+        self,
+        volume: Tensor,
+        cameras: Cameras,
+        view_mask: Tensor | None = None,
+        *,
+        size: tuple[int, int] | None = None,
+    ) -> Projected:
+        """Sweep and reduce a volume (B, C, D, H, W); `size` takes the place of the layer's."""
         device = volume.device if isinstance(volume, Tensor) else self.depths.device
         depths = moved("ProjectReduce", "depths", self.depths, device)
         return project_reduce(
@@ -383,7 +390,7 @@ class ProjectReduce(nn.Module):
             depths,
             self.weight,
             self.bias,
-            self.size,
+            self.size if size is None else size,
             view_mask=view_mask,
             mode=self.mode,
             padding_mode=self.padding_mode,

@@ -1,1 +1,29 @@
-"""The networks of the paper, and how they are trained and evaluated."""
+"""The learnt machines: V-LSM, D-LSM and the baseline 3D-R2N2, their losses and weights."""
+
+from lsmgeo.models.creating import create, from_settings, settings_of
+from lsmgeo.models.depth_lsm import DepthLSM
+from lsmgeo.models.losses import compute_loss, sum_loss
+from lsmgeo.models.model import Model
+from lsmgeo.models.outputs import DepthOutput, DepthResult, VoxelOutput, VoxelResult
+from lsmgeo.models.r2n2 import R2N2, R2N2Settings
+from lsmgeo.models.settings import DepthSettings, VoxelSettings
+from lsmgeo.models.voxel_lsm import VoxelLSM
+
+__all__ = [
+    "R2N2",
+    "DepthLSM",
+    "DepthOutput",
+    "DepthResult",
+    "DepthSettings",
+    "Model",
+    "R2N2Settings",
+    "VoxelLSM",
+    "VoxelOutput",
+    "VoxelResult",
+    "VoxelSettings",
+    "compute_loss",
+    "create",
+    "from_settings",
+    "settings_of",
+    "sum_loss",
+]

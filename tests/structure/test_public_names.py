@@ -28,7 +28,7 @@ INVENTORY = {
     },
     grids: {"FrustumGrid", "Lattice", "VoxelGrid", "depth_planes"},
     layers: {"PlaneSweepProject", "Unproject"},
-    fusion: {"Max", "Mean", "Variance"},
+    fusion: {"ConvGRU3d", "ConvLSTM3d", "Max", "Mean", "Variance"},
     rays: {"Composited", "ProjectReduce", "composite", "expected_depth", "max_along_rays", "project_reduce"},
     metrics: {
         "BadPixels", "CategoryMeans", "CloudScores", "DensityCurve", "DepthError", "DepthErrors", "MedianDepthError",
@@ -55,7 +55,7 @@ SIGNATURES = {
         "near=1e-06, backend='auto')"
     ),
     lsmgeo.Unproject.forward: "(self, features, cameras, view_mask=None, *, grid=None)",
-    lsmgeo.PlaneSweepProject.forward: "(self, volume, cameras, view_mask=None, *, grid=None, depths=None)",
+    lsmgeo.PlaneSweepProject.forward: "(self, volume, cameras, view_mask=None, *, grid=None, depths=None, size=None)",
     functional.unproject: (
         f"(features, cameras, grid, *, view_mask=None, mode='bilinear', padding_mode='zeros', {SAMPLING}, reduce=None, "
         "near=1e-06, backend='auto')"

@@ -1,0 +1,167 @@
+"""What the networks are made of: convolutions that keep sizes whole, instance norm, and the block of both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import conv2d, conv3d, conv_transpose2d, conv_transpose3d, group_norm, pad
+
+from lsmgeo._checks import check_choice
+
+__all__ = ["Block", "Convolution", "InstanceNorm"]
+
+NORMS = ("scale", "shift", "none")
+
+
+class Convolution(nn.Module):
+    """A convolution, or a transposed one, whose output is the input's size divided, or multiplied, by the stride.
+
+    What is padded in all is ``kernel_size - stride``, the odd pixel after the image. Where that is even, and with it
+    for every even kernel of stride 2, a map covers the same area before and after; where it is odd (3 x 3 of stride 2),
+    maps shift by half a pixel, as those of the released network do (TensorFlow's "SAME").
+
+    Args:
+        dims: 2 or 3.
+        in_channels: of the input.
+        out_channels: of the output.
+        kernel_size: at least the stride.
+        stride: must divide the input's sides, where it is not transposed.
+        transposed: whether to multiply by the stride.
+        groups: as in ``torch.nn.Conv2d``.
+        bias: whether to add a learned bias.
+
+    Example:
+        >>> from collections.abc import Callable
+
+    import torch
+        >>> from lsmgeo.models.blocks import Convolution
+        >>> down, up = Convolution(2, 3, 4, 5, stride=2), Convolution(2, 4, 3, 3, stride=2, transposed=True)
+        >>> tuple(down(torch.rand(1, 3, 12, 16)).shape), tuple(up(down(torch.rand(1, 3, 12, 16))).shape)
+        ((1, 4, 6, 8), (1, 3, 12, 16))
+    """
+
+    def __init__(
+        self,
+        dims: int,
+        in_channels: int,
+        out_channels: int,
+        kernel_size: int,
+        *,
+        stride: int = 1,
+        transposed: bool = False,
+        groups: int = 1,
+        bias: bool = True,
+    ) -> None:
+        super().__init__()
+        self.dims, self.stride, self.transposed, self.groups = dims, stride, transposed, groups
+        self.before, self.odd = divmod(kernel_size - stride, 2)
+        channels = (in_channels, out_channels // groups) if transposed else (out_channels, in_channels // groups)
+        self.weight = nn.Parameter(torch.empty(*channels, *(kernel_size,) * dims))
+        self.bias = nn.Parameter(torch.zeros(out_channels)) if bias else None
+        nn.init.xavier_uniform_(self.weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Convolve (N, C, H, W) or (N, C, D, H, W)."""
+        if self.transposed:
+            spread: Callable[..., Tensor] = conv_transpose2d if self.dims == 2 else conv_transpose3d
+            y = spread(x, self.weight, self.bias, self.stride, self.before, 0, self.groups)
+            for axis in range(-self.dims, 0) if self.odd else ():
+                y = y.narrow(axis, 0, y.shape[axis] - 1)
+            return y
+        if self.odd:
+            x = pad(x, (self.before, self.before + 1) * self.dims)
+        padding = 0 if self.odd else self.before
+        convolve: Callable[..., Tensor] = conv2d if self.dims == 2 else conv3d
+        return convolve(x, self.weight, self.bias, self.stride, padding, 1, self.groups)
+
+    def extra_repr(self) -> str:
+        """The arguments."""
+        kernel = "x".join(map(str, self.weight.shape[2:]))
+        first, second = self.weight.shape[:2]
+        channels = (first, second * self.groups) if self.transposed else (second * self.groups, first)
+        text = f"{channels[0]} -> {channels[1]}, {kernel}, stride={self.stride}"
+        return text + ", transposed" * self.transposed + f", groups={self.groups}" * (self.groups > 1)
+
+
+class InstanceNorm(nn.Module):
+    """Normalisation of each channel of each sample over its pixels, with a learned shift and, if wanted, scale.
+
+    Args:
+        channels: of the input.
+        scale: whether to learn a scale too.
+        eps: added to the variance.
+
+    Example:
+        >>> from collections.abc import Callable
+
+    import torch
+        >>> from lsmgeo.models.blocks import InstanceNorm
+        >>> InstanceNorm(1)(torch.tensor([0.0, 2.0, 4.0, 6.0]).reshape(1, 1, 2, 2)).flatten()
+        tensor([-1.3416, -0.4472, 0.4472, 1.3416], grad_fn=<ViewBackward0>)
+    """
+
+    def __init__(self, channels: int, *, scale: bool = True, eps: float = 1e-5) -> None:
+        super().__init__()
+        self.eps = eps
+        self.weight = nn.Parameter(torch.ones(channels)) if scale else None
+        self.bias = nn.Parameter(torch.zeros(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Normalise (N, C, ...)."""
+        # One group a channel: unlike `instance_norm`, it keeps channels-last memory.
+        return group_norm(x, x.shape[1], self.weight, self.bias, self.eps)
+
+
+class Block(nn.Module):
+    """Pre-activation: ReLU, `Convolution`, `InstanceNorm`.
+
+    Args:
+        dims: 2 or 3.
+        in_channels: of the input.
+        out_channels: of the output.
+        kernel_size: of the convolution.
+        norm: "scale" and "shift" learn both or the shift alone; after "none" the convolution has a bias.
+        activate: whether to begin with the ReLU; the first block of a network does not.
+        stride: see `Convolution`.
+        transposed: see `Convolution`.
+
+    Example:
+        >>> from collections.abc import Callable
+
+    import torch
+        >>> from lsmgeo.models.blocks import Block
+        >>> tuple(Block(3, 2, 5, 4, norm="scale", stride=2)(torch.rand(1, 2, 8, 8, 8)).shape)
+        (1, 5, 4, 4, 4)
+    """
+
+    def __init__(
+        self,
+        dims: int,
+        in_channels: int,
+        out_channels: int,
+        kernel_size: int,
+        *,
+        norm: str,
+        activate: bool = True,
+        stride: int = 1,
+        transposed: bool = False,
+    ) -> None:
+        super().__init__()
+        check_choice("Block", "norm", norm, NORMS)
+        self.activate = activate
+        self.convolution = Convolution(
+            dims,
+            in_channels,
+            out_channels,
+            kernel_size,
+            stride=stride,
+            transposed=transposed,
+            bias=norm == "none",
+        )
+        self.norm = nn.Identity() if norm == "none" else InstanceNorm(out_channels, scale=norm == "scale")
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (N, C, ...) to (N, C', ...)."""
+        return self.norm(self.convolution(x.relu() if self.activate else x))

@@ -1,0 +1,120 @@
+"""What training makes small: cross-entropy of occupancy, absolute error of depth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
+
+from lsmgeo._checks import check_choice
+from lsmgeo.data.sample import Batch
+from lsmgeo.errors import DTypeError, ShapeError
+from lsmgeo.models.outputs import DepthOutput, VoxelOutput, chosen_steps
+
+__all__ = ["compute_loss", "sum_loss"]
+
+FAR = 10.0  # of the background, as in the release's depth maps
+
+
+def sum_loss(
+    output: VoxelOutput | DepthOutput,
+    batch: Batch,
+    *,
+    region: str = "object",
+    steps: str | Sequence[int] | None = None,
+) -> tuple[Tensor, Tensor]:
+    """The loss as a sum and a count, which several processes add up before they divide; see `compute_loss`.
+
+    Args:
+        output: of a model.
+        batch: what it was fed with.
+        region: see `compute_loss`.
+        steps: see `compute_loss`.
+
+    Returns:
+        The sum of the terms and how many there are, both float32 scalars; the sum alone is differentiable.
+
+    Raises:
+        ShapeError, DTypeError, OptionError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.data import Batch
+        >>> from lsmgeo.models import VoxelOutput
+        >>> there = torch.tensor([[True, True], [True, False]])
+        >>> solid = torch.ones(2, 4, 4, 4, dtype=torch.bool)
+        >>> batch = Batch(torch.zeros(2, 2, 3, 8, 8), None, None, None, solid, (), (), (), there)
+        >>> sum_loss(VoxelOutput(torch.zeros(2, 2, 4, 4, 4)), batch)[1]  # three views of 64 voxels
+        tensor(192.)
+    """
+    who = "sum_loss"
+    check_choice(who, "region", region, ("object", "all"))
+    if isinstance(output, VoxelOutput):
+        predicted, truth, form = output.logits, batch.occupancy, "occupancy of (B, D, H, W)"
+    elif isinstance(output, DepthOutput):
+        predicted, truth, form = output.depth, batch.depth, "depth of (B, V, H, W)"
+    else:
+        raise DTypeError(f"{who}: output must be a VoxelOutput or a DepthOutput; got {type(output).__name__}")
+    if truth is None:
+        raise DTypeError(f"{who}: batch must have {form}; got None")
+    if predicted.shape[0] != truth.shape[0] or predicted.shape[2:] != truth.shape[1:]:
+        raise ShapeError(
+            f"{who}: batch must have {form} as predicted, {tuple(predicted.shape)}; got {tuple(truth.shape)}"
+        )
+    after = chosen_steps(who, steps, batch.view_mask.shape[1])
+    if predicted.shape[1] != len(after):
+        raise ShapeError(f"{who}: output must be after {len(after)} steps; got {tuple(predicted.shape)}")
+    # After the last of the views there is always something to tell, also where its own place is padding.
+    is_told = batch.view_mask.any(1, keepdim=True) if steps == "last" else batch.view_mask[:, after]
+    weight = is_told.float()[:, :, None, None, None]
+    if isinstance(output, VoxelOutput):
+        target = truth[:, None].float().expand(predicted.shape)
+        terms = binary_cross_entropy_with_logits(predicted.float(), target, reduction="none")
+    else:
+        is_object = truth > 0 if batch.mask is None else (truth > 0) & batch.mask
+        counted = is_object if region == "object" else torch.ones_like(is_object)
+        weight = weight * (counted & batch.view_mask[:, :, None, None])[:, None]
+        terms = (predicted.float() - torch.where(is_object, truth, FAR)[:, None]).abs()
+    # The choice, not the product alone: nothing that does not count may reach the sum as infinity times 0.
+    terms = torch.where(weight > 0, terms, 0.0)
+    return terms.sum(), weight.expand(terms.shape).sum()
+
+
+def compute_loss(
+    output: VoxelOutput | DepthOutput,
+    batch: Batch,
+    *,
+    region: str = "object",
+    steps: str | Sequence[int] | None = None,
+) -> Tensor:
+    """The loss of a model's output: the mean over scenes, over the steps that they have, and over voxels or pixels.
+
+    Equation: binary cross-entropy of occupancy; absolute error of depth (Kar, Haene and Malik, "Learning a Multi-View
+    Stereo Machine", 2017, section 3). In float32 whatever the output's dtype.
+
+    Args:
+        output: of a model.
+        batch: what it was fed with, with `occupancy` of the output's resolution, or `depth`.
+        region: of depth maps: "object" for the pixels on the object, "all" for every pixel of the views that are there,
+            with the background 10 units away (the release's).
+        steps: what the model was called with. A scene's steps that are padding do not count.
+
+    Returns:
+        A scalar, float32; 0 where nothing counts.
+
+    Raises:
+        ShapeError, DTypeError, OptionError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.data import Batch
+        >>> from lsmgeo.models import VoxelOutput
+        >>> there, solid = torch.ones(1, 2, dtype=torch.bool), torch.ones(1, 4, 4, 4, dtype=torch.bool)
+        >>> batch = Batch(torch.zeros(1, 2, 3, 8, 8), None, None, None, solid, (), (), (), there)
+        >>> compute_loss(VoxelOutput(torch.zeros(1, 2, 4, 4, 4)), batch)  # log 2
+        tensor(0.6931)
+    """
+    total, count = sum_loss(output, batch, region=region, steps=steps)
+    return total / count.clamp_min(1.0)

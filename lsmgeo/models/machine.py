@@ -1,0 +1,113 @@
+"""What both learnt stereo machines begin with: from images and cameras to the grid that knows the shape."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lsmgeo._checks import check_devices, check_float, check_mask
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes
+from lsmgeo.errors import ShapeError
+from lsmgeo.fusion import ConvGRU3d, ConvLSTM3d
+from lsmgeo.grids import VoxelGrid
+from lsmgeo.layers import Unproject
+from lsmgeo.models.grid_unet import GridUNet
+from lsmgeo.models.image_encoder import ImageEncoder
+from lsmgeo.models.model import Model
+from lsmgeo.models.outputs import chosen_steps
+from lsmgeo.models.settings import MachineSettings
+
+__all__ = ["Machine", "Seen", "evaluating", "views_of"]
+
+
+class Seen(NamedTuple):
+    """Grids (B, S, C, D, H, W) after S of the views, and the image encoder's early maps (B, V, C, h, w)."""
+
+    grids: Tensor
+    maps: tuple[Tensor, ...]
+
+
+class Machine(Model):
+    """Image encoder, unprojection, recurrent fusion, grid network: a `Seen` of images and cameras."""
+
+    def __init__(self, settings: MachineSettings) -> None:
+        super().__init__()
+        is_release = settings.variant == "release"
+        self.image_size = settings.image_size
+        self.resolution = settings.resolution
+        self.grid = VoxelGrid(settings.resolution)
+        self.image_encoder = ImageEncoder(settings)
+        # "zeros": what lies outside an image is told apart from what looks like its border; the release smears that.
+        self.unproject = Unproject(
+            VoxelGrid(settings.grid_size),
+            padding_mode="border" if is_release else "zeros",
+            augment="depth" if is_release else ("depth", "direction"),
+        )
+        recurrence = ConvGRU3d if settings.fusion == "gru" else ConvLSTM3d
+        self.fusion = recurrence(
+            settings.feature_channels + (1 if is_release else 4),
+            settings.hidden_channels,
+            eps=1e-12 if is_release else 1e-5,
+        )
+        self.grid_network = GridUNet(settings)
+
+    def see(
+        self,
+        images: Tensor,
+        cameras: Cameras,
+        view_mask: Tensor | None,
+        steps: str | Sequence[int] | None,
+    ) -> Seen:
+        """The common part of `forward`, whose arguments these are."""
+        after = chosen_steps(self.name, steps, self._check(images, view_mask))
+        if view_mask is not None:
+            images = torch.where(view_mask[:, :, None, None, None], images, 0.0)
+        views = tuple(images.shape[:2])
+        features, maps = self.image_encoder(images.flatten(0, 1))
+        volume, visible = self.unproject(features.unflatten(0, views), cameras, view_mask)
+        states = self.fusion.states(volume, visible, view_mask)[:, after]
+        grids = self.grid_network(states.flatten(0, 1)).unflatten(0, states.shape[:2])
+        return Seen(grids, tuple(item.unflatten(0, views) for item in maps))
+
+    def _check(self, images: Tensor, view_mask: Tensor | None) -> int:
+        """Check images and mask; the number of views."""
+        stride = 1 << len(self.image_encoder.down)
+        expected = f"(B, V, 3, H, W), V at least 1, H and W multiples of {stride}, {2 * stride} at least"
+        check_float(self.name, "images", images, expected, 5)
+        _, V, channels, height, width = images.shape
+        if V < 1 or channels != 3 or height % stride or width % stride or min(height, width) < 2 * stride:
+            raise ShapeError(f"{self.name}: images must be {expected}; got {tuple(images.shape)}")
+        if view_mask is not None:
+            check_mask(self.name, "view_mask", view_mask, tuple(images.shape[:2]), "(B, V)")
+            check_devices(self.name, images=images, view_mask=view_mask)
+        return V
+
+
+@contextmanager
+def evaluating(model: nn.Module) -> Iterator[None]:
+    """Evaluation mode and no gradients inside; the mode before, after."""
+    was_training = model.training
+    model.eval()
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        model.train(was_training)
+
+
+def views_of(who: str, cameras: Cameras, scenes: int) -> CameraTensors:
+    """Cameras with the leading shape (B, V), whatever form they came in."""
+    tensors = as_tensors(cameras, who)
+    leading = tuple(tensors.cam_from_world.shape[:-2])
+    if len(leading) == 2 and leading[0] == scenes:
+        return tensors
+    if len(leading) != 1 or scenes == 0 or leading[0] % scenes:
+        raise ShapeError(f"{who}: cameras must have leading shape (B, V) or (B*V,) with B = {scenes}; got {leading}")
+    K, E, height, width = (
+        item.unflatten(0, (scenes, -1)) for item in (tensors.intrinsics, tensors.cam_from_world, *image_sizes(tensors))
+    )
+    return CameraTensors(K, E, height, width)

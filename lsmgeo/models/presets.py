@@ -1,0 +1,77 @@
+"""Settings by name: "paper" as published, "compact" for an hour of two CPU cores, "tiny" for tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lsmgeo.models.r2n2 import R2N2Settings
+from lsmgeo.models.settings import DepthSettings, VoxelSettings
+
+__all__ = ["PRESETS", "RELEASES"]
+
+_COMPACT: dict[str, Any] = {
+    "image_size": 64,
+    "grid_size": 16,
+    "upsample": 2,
+    "encoder_channels": (32, 64, 96),
+    "grid_channels": (48, 96),
+    "output_channels": 24,
+    "feature_stride": 4,
+}
+_TINY: dict[str, Any] = {
+    "image_size": 32,
+    "grid_size": 8,
+    "upsample": 2,
+    "encoder_channels": (8, 12),
+    "grid_channels": (12, 16),
+    "feature_channels": 8,
+    "hidden_channels": 8,
+    "output_channels": 8,
+}
+_COMPACT_R2N2: dict[str, Any] = {
+    "image_size": 64,
+    "channels": (32, 64, 96, 128, 128),
+    "shortcuts": ("none", "convolution", "convolution", "convolution", "identity"),
+    "features": 256,
+    "pose_features": 64,
+    "hidden": 64,
+    "decoder": (64, 32, 16, 8),
+}
+_TINY_R2N2: dict[str, Any] = {
+    "image_size": 32,
+    "channels": (8, 12, 16, 16),
+    "shortcuts": ("none", "convolution", "convolution", "identity"),
+    "features": 12,
+    "pose_features": 4,
+    "hidden": 8,
+    "decoder": (8, 8, 4),
+}
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "voxel-lsm": {
+        "paper": VoxelSettings(),
+        "compact": VoxelSettings(**_COMPACT),
+        "tiny": VoxelSettings(**_TINY),
+    },
+    "depth-lsm": {
+        "paper": DepthSettings(),
+        "compact": DepthSettings(**_COMPACT, planes=24, ray_channels=(128, 64), projection="trilinear"),
+        "tiny": DepthSettings(**_TINY, planes=8, ray_channels=(16, 12), projection="trilinear"),
+    },
+    "r2n2": {
+        "paper": R2N2Settings(),
+        "compact": R2N2Settings(**_COMPACT_R2N2),
+        "tiny": R2N2Settings(**_TINY_R2N2),
+    },
+    "r2n2-pose": {
+        "paper": R2N2Settings(pose=True),
+        "compact": R2N2Settings(pose=True, **_COMPACT_R2N2),
+        "tiny": R2N2Settings(pose=True, **_TINY_R2N2),
+    },
+}
+
+# Built layer by layer as released; there is one of each.
+RELEASES: dict[str, Any] = {
+    "voxel-lsm": VoxelSettings(variant="release"),
+    "depth-lsm": DepthSettings(variant="release", ray_channels=(512,)),
+}

@@ -8,6 +8,7 @@ from lsmgeo.models.outputs import DepthOutput, DepthResult, VoxelOutput, VoxelRe
 from lsmgeo.models.r2n2 import R2N2, R2N2Settings
 from lsmgeo.models.settings import DepthSettings, VoxelSettings
 from lsmgeo.models.voxel_lsm import VoxelLSM
+from lsmgeo.models.weights import load, write_weights
 
 __all__ = [
     "R2N2",
@@ -24,6 +25,8 @@ __all__ = [
     "compute_loss",
     "create",
     "from_settings",
+    "load",
     "settings_of",
     "sum_loss",
+    "write_weights",
 ]

@@ -11,7 +11,7 @@ import json
 import math
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ import safetensors
 import safetensors.torch
 import torch
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from lsmgeo.data.files import read_bytes, write_atomic
 from lsmgeo.errors import CheckpointError, DataError, LsmGeoError, OptionError
@@ -45,6 +46,11 @@ MAX_TENSORS = 10_000
 DTYPES = {
     "F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16, "I64": torch.int64,
     "I32": torch.int32, "U8": torch.uint8, "BOOL": torch.bool,
+}  # fmt: skip
+# What gives a parameter its first values.
+STARTING = {
+    "add_", "clamp_", "constant_", "copy_", "erfinv_", "fill_", "kaiming_normal_", "kaiming_uniform_", "mul_",
+    "normal_", "uniform_", "zero_",
 }  # fmt: skip
 NAMES = {dtype: name for name, dtype in DTYPES.items()}
 
@@ -108,13 +114,14 @@ def load(path: str | os.PathLike[str]) -> Model:
         CheckpointError: there is no such file, it is damaged, or it does not hold what its settings describe.
     """
     weights = read_weights(path)
-    # Without memory first: settings that a file does not live up to must not allocate what they describe.
-    with torch.device("meta"):
-        plan = _make(weights)
-    _check_fit(plan, weights)
-    with torch.random.fork_rng(devices=[]):
-        model = _make(weights)
-    fill_model(model, weights)
+    # Settings that a file does not live up to must not allocate what they describe.
+    with _WithoutMemory(), torch.random.fork_rng(devices=[]):
+        try:
+            model = from_settings(dict(weights.settings))
+        except (LsmGeoError, TypeError, ValueError, KeyError, RuntimeError) as error:
+            raise CheckpointError(weights.path, f"holds settings of no model ({str(error)[:400]})") from error
+    _check_fit(model, weights)
+    model.load_state_dict({name: tensor.clone() for name, tensor in weights.tensors.items()}, assign=True)
     return model.eval()
 
 
@@ -241,11 +248,20 @@ def _read(path: Path) -> Weights:
     return parse_weights(read_file(path), path)
 
 
-def _make(weights: Weights) -> Model:
-    try:
-        return from_settings(dict(weights.settings))
-    except (LsmGeoError, TypeError, ValueError, KeyError, RuntimeError) as error:
-        raise CheckpointError(weights.path, f"holds settings of no model ({str(error)[:400]})") from error
+class _WithoutMemory(TorchFunctionMode):
+    """Makes parameters of a shape alone, not all tensors as ``torch.device("meta")``, whose arithmetic loads sympy."""
+
+    def __torch_function__(
+        self, func: Callable, types: Sequence[type], args: tuple = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        options = dict(kwargs or {})
+        if func is torch.empty:
+            options["device"] = "meta"
+        elif getattr(func, "__name__", "") in STARTING:
+            target = args[0] if args else options["tensor"]
+            if target.is_meta:
+                return target
+        return func(*args, **options)
 
 
 def _check_fit(model: nn.Module, weights: Weights) -> None:

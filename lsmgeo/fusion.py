@@ -129,8 +129,8 @@ class _Recurrent(nn.Module):
         inputs = self.input(volume.flatten(0, 1)).unflatten(0, (B, V))
         outputs: list[Tensor] = []
         state: tuple[Tensor, ...] | None = None
-        for view in range(V):
-            new = self._step(inputs[:, view].chunk(self.parts, 1), state)
+        for view, x in enumerate(inputs.unbind(1)):
+            new = self._step(x.chunk(self.parts, 1), state)
             if view_mask is not None:
                 is_there = view_mask[:, view, None, None, None, None]
                 old = tuple(torch.zeros_like(part) for part in new) if state is None else state

@@ -42,8 +42,6 @@ class GridUNet(nn.Module):
         after = (*reversed(settings.grid_channels[:-1]), settings.output_channels)
         before = (channels[-1], *(2 * width for width in after[:-1]))
         pairs = list(zip(before, after, strict=True))
-        if settings.upsample == 2:
-            pairs.append((settings.output_channels, settings.output_channels))
         self.up = nn.ModuleList(
             Block(3, first, second, 4, norm=norm, stride=2, transposed=True) for first, second in pairs
         )

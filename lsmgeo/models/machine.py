@@ -38,12 +38,12 @@ class Machine(Model):
         super().__init__()
         is_release = settings.variant == "release"
         self.image_size = settings.image_size
-        self.resolution = settings.resolution
-        self.grid = VoxelGrid(settings.resolution)
+        self.resolution = settings.grid_size
+        self.grid = VoxelGrid(settings.grid_size)
         self.image_encoder = ImageEncoder(settings)
         # "zeros": what lies outside an image is told apart from what looks like its border; the release smears that.
         self.unproject = Unproject(
-            VoxelGrid(settings.grid_size),
+            self.grid,
             padding_mode="border" if is_release else "zeros",
             augment="depth" if is_release else ("depth", "direction"),
         )

@@ -12,7 +12,6 @@ __all__ = ["PRESETS", "RELEASES"]
 _COMPACT: dict[str, Any] = {
     "image_size": 64,
     "grid_size": 16,
-    "upsample": 2,
     "encoder_channels": (32, 64, 96),
     "grid_channels": (48, 96),
     "output_channels": 24,
@@ -21,7 +20,6 @@ _COMPACT: dict[str, Any] = {
 _TINY: dict[str, Any] = {
     "image_size": 32,
     "grid_size": 8,
-    "upsample": 2,
     "encoder_channels": (8, 12),
     "grid_channels": (12, 16),
     "feature_channels": 8,
@@ -50,8 +48,8 @@ _TINY_R2N2: dict[str, Any] = {
 PRESETS: dict[str, dict[str, Any]] = {
     "voxel-lsm": {
         "paper": VoxelSettings(),
-        "compact": VoxelSettings(**_COMPACT),
-        "tiny": VoxelSettings(**_TINY),
+        "compact": VoxelSettings(**_COMPACT, upsample=2),
+        "tiny": VoxelSettings(**_TINY, upsample=2),
     },
     "depth-lsm": {
         "paper": DepthSettings(),

@@ -24,7 +24,6 @@ class MachineSettings:
         variant: "paper" or "release", see the models.
         image_size: side of the square images in pixels that it is meant for; other sizes work.
         grid_size: voxels along a side of the grid on which views are fused.
-        upsample: 2 if the grid network's output is twice as fine as the grid, else 1.
         encoder_channels: of the image encoder's levels, each of half the size of the one before.
         feature_channels: of the features that are unprojected.
         feature_stride: pixels of the image to a pixel of the features, a power of 2.
@@ -37,7 +36,6 @@ class MachineSettings:
     variant: str = "paper"
     image_size: int = 224
     grid_size: int = 32
-    upsample: int = 1
     encoder_channels: tuple[int, ...] = (32, 64, 128, 256)
     feature_channels: int = 32
     feature_stride: int = 2
@@ -51,11 +49,6 @@ class MachineSettings:
         """What the sides of images must be divisible by."""
         return 1 << len(self.encoder_channels)
 
-    @property
-    def resolution(self) -> int:
-        """Voxels along a side of the grid network's output."""
-        return self.grid_size * self.upsample
-
     def check(self, who: str) -> None:
         """Raise an `OptionError` that names the first impossible setting."""
         check_choice(who, "variant", self.variant, VARIANTS)
@@ -64,7 +57,6 @@ class MachineSettings:
             check_whole(who, name, getattr(self, name), 1, LARGEST_SIDE)
         for name in ("encoder_channels", "grid_channels"):
             check_channels(who, name, getattr(self, name))
-        check_whole(who, "upsample", self.upsample, 1, 2)
         check_whole(who, "image_size", self.image_size, 1, LARGEST_SIDE)
         check_whole(who, "grid_size", self.grid_size, 1, 256)
         # Maps of one pixel have no variance to be normalised by.
@@ -84,7 +76,20 @@ class MachineSettings:
 
 @dataclass(frozen=True)
 class VoxelSettings(MachineSettings):
-    """What a `VoxelLSM` is built from."""
+    """What a `VoxelLSM` is built from.
+
+    Attributes:
+        upsample: voxels of the occupancy along a side of one of the grid's: a cheap way to a finer output.
+    """
+
+    upsample: int = 1
+
+    def check(self, who: str) -> None:
+        """Raise an `OptionError` that names the first impossible setting."""
+        super().check(who)
+        check_whole(who, "upsample", self.upsample, 1, 4)
+        if self.upsample > 1 and self.variant == "release":
+            raise OptionError(f"{who}: upsample must be 1 in the variant 'release'; got {self.upsample}")
 
 
 @dataclass(frozen=True)

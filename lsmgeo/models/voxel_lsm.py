@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lsmgeo._checks import check_flag
 from lsmgeo.cameras.tensors import Cameras
+from lsmgeo.grids import VoxelGrid
 from lsmgeo.models.blocks import Block
 from lsmgeo.models.machine import Machine, evaluating
 from lsmgeo.models.outputs import VoxelOutput, VoxelResult
@@ -64,7 +65,10 @@ class VoxelLSM(Machine):
         self.settings = settings
         is_release = settings.variant == "release"
         # One channel: the softmax of two classes is the sigmoid of their difference.
-        self.out = Block(3, settings.output_channels, 1, 4 if is_release else 3, norm="none", transposed=is_release)
+        parts = settings.upsample**3
+        self.out = Block(3, settings.output_channels, parts, 4 if is_release else 3, norm="none", transposed=is_release)
+        self.resolution = settings.grid_size * settings.upsample
+        self.grid = VoxelGrid(self.resolution)
 
     def forward(
         self,
@@ -89,8 +93,10 @@ class VoxelLSM(Machine):
             ShapeError, DTypeError, DeviceError, CameraError, OptionError: see `lsmgeo.errors`.
         """
         grids, _ = self.see(images, cameras, view_mask, steps)
-        logits = self.out(grids.flatten(0, 1)).squeeze(1)
-        return VoxelOutput(logits.unflatten(0, grids.shape[:2]))
+        logits = self.out(grids.flatten(0, 1))
+        if self.settings.upsample > 1:
+            logits = _interleave(logits, self.settings.upsample)
+        return VoxelOutput(logits.squeeze(1).unflatten(0, grids.shape[:2]))
 
     def run(
         self, images: Tensor, cameras: Cameras, view_mask: Tensor | None = None, *, by_view: bool = True
@@ -114,3 +120,10 @@ class VoxelLSM(Machine):
             logits = self(images, cameras, view_mask, steps=None if by_view else "last").logits
             occupancy = logits.float().sigmoid()
         return VoxelResult(occupancy[:, -1], occupancy if by_view else None)
+
+
+def _interleave(parts: Tensor, factor: int) -> Tensor:
+    """Channels (N, factor^3, D, H, W) as the voxels of a finer grid, (N, 1, factor D, factor H, factor W)."""
+    x = parts.unflatten(1, (factor, factor, factor))  # (N, z, y, x, D, H, W)
+    x = x.permute(0, 4, 1, 5, 2, 6, 3)
+    return x.flatten(5, 6).flatten(3, 4).flatten(1, 2)[:, None]

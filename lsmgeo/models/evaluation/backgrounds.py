@@ -1,0 +1,64 @@
+"""The last line of table 1: voxel IoU in front of white and of random backgrounds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lsmgeo.models.evaluation.contenders import Contender, pick
+from lsmgeo.models.evaluation.facts import facts_of
+from lsmgeo.models.evaluation.iou import measure_iou
+from lsmgeo.models.evaluation.options import Options
+from lsmgeo.models.evaluation.paper import IOU, paper_row
+from lsmgeo.models.evaluation.plots import Curve, draw_curves
+from lsmgeo.models.evaluation.report import Report, Row, Table
+from lsmgeo.models.evaluation.scores import Scores, joined
+from lsmgeo.models.evaluation.shapes import Shapes
+
+__all__ = ["report_backgrounds"]
+
+VIEWS = 4
+PAPER = ("V-LSM", "V-LSM w/bg")
+
+
+def report_backgrounds(contenders: Sequence[Contender], shapes: Shapes, options: Options) -> Report:
+    """Measure IoU of every model in front of white and in front of `options.background`.
+
+    The paper trains and tests "V-LSM w/bg" on random images as backgrounds; a model that was trained on white alone
+    shows what that is good for.
+
+    Args:
+        contenders: voxel models of one resolution.
+        shapes: what is evaluated on.
+        options: views (4), background, threshold, batch.
+
+    Returns:
+        Table "views" with two lines a model.
+
+    Raises:
+        OptionError: a model that gives no voxels, or models of different resolutions.
+    """
+    notes: list[str] = []
+    contenders = pick(contenders, "backgrounds", depth=False)
+    views = options.views_of(VIEWS, shapes.most_views, notes)
+    backgrounds = {"white": "white", "random": options.background}
+    measured = {
+        words: measure_iou(contenders, shapes, views, options, hulls=False, background=background)
+        for words, background in backgrounds.items()
+    }
+    scores: dict[str, Scores] = {
+        f"{contender.name}, {words} behind": measured[words][contender.name]
+        for contender in contenders
+        for words in backgrounds
+    }
+    rows = [Row(name, one.cells(100)) for name, one in scores.items()]
+    rows += [paper_row(name, IOU[name], views) for name in PAPER]
+    places = range(1, views + 1)
+    curves = [Curve(name, places, one.cells(100)) for name, one in scores.items()]
+    return Report(
+        "backgrounds",
+        [Table("views", "voxel IoU [%], views:", [str(place) for place in places], rows)],
+        facts_of(contenders, shapes, options, views=views, background=str(options.background)),
+        joined(scores, "iou"),
+        {"backgrounds": draw_curves(curves, title="White and other backgrounds", across="views", up="voxel IoU [%]")},
+        notes=notes,
+    )

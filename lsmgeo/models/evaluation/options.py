@@ -1,0 +1,57 @@
+"""What can be chosen of an evaluation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lsmgeo._checks import check_number, check_whole
+from lsmgeo.data.backgrounds import Background
+from lsmgeo.errors import OptionError
+
+__all__ = ["Options"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """How reports measure; each takes what concerns it.
+
+    Attributes:
+        views: the largest number of views; None for what the paper has, as far as the data go.
+        threshold: of probabilities, for IoU.
+        batch: shapes at a time.
+        seed: of the orders of views and of noise in poses.
+        background: for "backgrounds", what stands behind the objects: "random", a folder of pictures or a colour.
+        degrees: for "pose-noise", the largest angles by which cameras are turned.
+        orders: for "order", in how many orders the views are given.
+        planes: for "depth" and "clouds", of the plane sweep.
+        window: side of its patches in pixels.
+        progress: whether to show progress bars (on a terminal).
+    """
+
+    views: int | None = None
+    threshold: float = 0.4
+    batch: int = 4
+    seed: int = 0
+    background: Background = "random"
+    degrees: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0)
+    orders: int = 8
+    planes: int = 300
+    window: int = 5
+    progress: bool = False
+
+    def __post_init__(self) -> None:
+        if self.views is not None:
+            check_whole("evaluate", "views", self.views, 1, 1000)
+        check_number("evaluate", "threshold", self.threshold, "a number")
+        for name, least in (("batch", 1), ("seed", 0), ("orders", 2), ("planes", 3), ("window", 1)):
+            check_whole("evaluate", name, getattr(self, name), least, 2**32 - 1)
+        angles = [check_number("evaluate", "degrees", angle, "degrees from 0 to 180") for angle in self.degrees]
+        if not angles or not all(0 <= angle <= 180 for angle in angles):
+            raise OptionError(f"evaluate: degrees must be from 0 to 180; got {self.degrees}")
+
+    def views_of(self, usual: int, there: int, notes: list[str]) -> int:
+        """How many views are taken: those asked for or the usual number, as far as the data go, which is noted."""
+        wanted = self.views or usual
+        if wanted > there:
+            notes.append(f"the shapes have {there} views; {wanted} were wanted")
+        return min(wanted, there)

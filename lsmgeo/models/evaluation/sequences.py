@@ -1,0 +1,84 @@
+"""The qualitative figure: views in order, what is predicted after each of them, and the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lsmgeo.models.evaluation.contenders import Contender, one_resolution, pick
+from lsmgeo.models.evaluation.facts import facts_of
+from lsmgeo.models.evaluation.options import Options
+from lsmgeo.models.evaluation.plots import sheet
+from lsmgeo.models.evaluation.report import Report, Row, Table
+from lsmgeo.models.evaluation.scores import Scores, iou_by_view, joined
+from lsmgeo.models.evaluation.shapes import Shapes, batches
+from lsmgeo.models.pictures import Picture, draw_voxels
+
+__all__ = ["as_picture", "report_sequences"]
+
+VIEWS = 4
+SIDE = 128
+# More shapes than this are measured, not drawn.
+MOST_DRAWN = 26
+
+
+def report_sequences(contenders: Sequence[Contender], shapes: Shapes, options: Options) -> Report:
+    """Draw what models predict after each of a sequence of views (Kar et al. 2017, figure 3), with the IoU of each.
+
+    Args:
+        contenders: voxel models of one resolution: in the paper V-LSM and 3D-R2N2 w/pose.
+        shapes: of which the first 26 are drawn.
+        options: views (4), threshold, batch.
+
+    Returns:
+        A picture a shape and a table of their IoU.
+
+    Raises:
+        OptionError: a model that gives no voxels, or models of different resolutions.
+    """
+    notes: list[str] = []
+    contenders = pick(contenders, "sequences", depth=False)
+    views = options.views_of(VIEWS, shapes.most_views, notes)
+    scores = {contender.name: Scores() for contender in contenders}
+    pictures: dict[str, bytes] = {}
+    resolution = one_resolution(contenders)
+    for batch in batches(shapes, views, options.batch, resolution=resolution, progress=options.progress):
+        assert batch.occupancy is not None
+        found = {contender.name: contender.occupancies(batch.images, batch.cameras) for contender in contenders}
+        for name, predicted in found.items():
+            iou = iou_by_view(predicted, batch.occupancy, options.threshold)
+            scores[name].add(batch.name, batch.category, iou)
+        for place, shape in enumerate(batch.name):
+            if len(pictures) < MOST_DRAWN:
+                solids = {name: predicted[place] > options.threshold for name, predicted in found.items()}
+                pictures[f"sequences-{shape.replace('/', '_')}"] = _draw(
+                    batch.images[place], solids, batch.occupancy[place], shape
+                )
+    names = next(iter(scores.values())).names
+    columns = [str(view) for view in range(1, views + 1)]
+    tables = [
+        Table(name, f"{name}, voxel IoU [%], views:", columns, [Row("mean of categories", one.cells(100))])
+        for name, one in scores.items()
+    ]
+    if len(names) > len(pictures):
+        notes.append(f"{len(pictures)} of {len(names)} shapes are drawn")
+    facts = facts_of(contenders, shapes, options, views=views, threshold=options.threshold)
+    return Report("sequences", tables, facts, joined(scores, "iou"), pictures, notes=notes)
+
+
+def _draw(images: Tensor, solids: dict[str, Tensor], truth: Tensor, shape: str) -> bytes:
+    views = len(images)
+    true = draw_voxels(truth, size=SIDE)
+    rows: list[list[Picture | None]] = [[*(as_picture(image, SIDE) for image in images), true]]
+    rows += [[draw_voxels(solid, size=SIDE) for solid in by_view] + [None] for by_view in solids.values()]
+    columns = [f"view {view}" for view in range(1, views + 1)]
+    return sheet(rows, ["views", *solids], [*columns, "truth"], title=f"{shape}: after each view")
+
+
+def as_picture(image: Tensor, side: int) -> Picture:
+    """A picture (3, h, w) as (side, side, 3) uint8."""
+    smooth = torch.nn.functional.interpolate(image[None].float(), (side, side), mode="bilinear", antialias=True)[0]
+    return np.asarray((smooth.clamp(0, 1) * 255).round().byte().permute(1, 2, 0))

@@ -190,7 +190,7 @@ def _shifted(R: Floats, turn: float, lift: float) -> Floats:
 
 
 def _splat(quads: Floats, colours: Floats, view: Floats, size: int, reach: float) -> Picture:
-    """Draw quads (Q, 4, 3), or points (Q, 1, 3), of one colour each, near over far, as seen from far away."""
+    """Draw quads (Q, 4, 3) of one colour each, near over far, as seen from far away."""
     fine = size * FINER
     picture = np.full((fine * fine, 3), BACKGROUND)
     if len(quads):
@@ -204,11 +204,7 @@ def _splat(quads: Floats, colours: Floats, view: Floats, size: int, reach: float
 
 
 def _dots(quads: Floats, scale: float) -> Floats:
-    """Dots (Q, N, 3) of quads, so dense that nothing shows between them at so many pixels a unit; of points around."""
-    if quads.shape[1] == 1:
-        half = 0.5 / scale
-        offsets = np.stack(np.meshgrid(*[(-half, half)] * 3, indexing="ij"), -1).reshape(-1, 3)
-        return quads + offsets
+    """Dots (Q, N, 3) of quads, so dense that nothing shows between them at so many pixels a unit."""
     widest = float(np.linalg.norm(quads - np.roll(quads, 1, 1), axis=-1).max())
     number = int(np.clip(np.ceil(1.5 * scale * widest), 2, 24))
     s, t = (axis.reshape(-1) for axis in np.meshgrid(*[np.linspace(0, 1, number)] * 2))
@@ -222,6 +218,7 @@ def draw_points(
     elevation: float = 25.0,
     size: int = 192,
     *,
+    dot: float = 1.5,
     reach: float = REACH,
 ) -> Picture:
     """Draw coloured points of the world as small squares, near ones over far ones, as seen from far away.
@@ -232,13 +229,17 @@ def draw_points(
         azimuth: degrees, see `draw_voxels`.
         elevation: degrees in (-90, 90).
         size: height and width of the picture in pixels.
+        dot: side of a point in pixels.
         reach: half the side of what is seen, world units.
 
     Returns:
         (size, size, 3) uint8 RGB on white.
     """
-    places = np.asarray(points, np.float64).reshape(-1, 1, 3)
-    return _splat(places, np.asarray(colours) / 255.0, _looking("draw_points", azimuth, elevation), size, reach)
+    view = _looking("draw_points", azimuth, elevation)
+    half = dot * reach / size
+    corners = np.array([(-half, -half), (half, -half), (-half, half), (half, half)]) @ view[:2]
+    quads = np.asarray(points, np.float64).reshape(-1, 1, 3) + corners
+    return _splat(quads, np.asarray(colours) / 255.0, view, size, reach)
 
 
 def tile(pictures: Sequence[Sequence[Picture | None]], gap: int = 4) -> Picture:

@@ -59,6 +59,10 @@ def report_backgrounds(contenders: Sequence[Contender], shapes: Shapes, options:
         [Table("views", "voxel IoU [%], views:", [str(place) for place in places], rows)],
         facts_of(contenders, shapes, options, views=views, background=str(options.background)),
         joined(scores, "iou"),
-        {"backgrounds": draw_curves(curves, title="White and other backgrounds", across="views", up="voxel IoU [%]")},
+        {
+            "backgrounds": draw_curves(
+                curves, title="White and other backgrounds", data=shapes.about, across="views", up="voxel IoU [%]"
+            )
+        },
         notes=notes,
     )

@@ -133,7 +133,9 @@ def _draw(
     camera = select(select(batch.cameras, 0, 0), 0, 0)
     rows: list[list[Picture | None]] = []
     for name in methods:
-        shaded = [draw_depth(depths[name, count][0], camera, size=SIDE) for count in counts]
+        shaded: list[Picture | None] = [draw_depth(depths[name, count][0], camera, size=SIDE) for count in counts]
+        if name == TRUTH:
+            shaded[1:] = [None] * len(shaded[1:])  # the first view's is the same
         drawn = [draw_points(*clouds[name, count], size=SIDE) for count in counts]
         rows.append([as_picture(batch.images[0, 0], SIDE) if name == TRUTH else None, *shaded, *drawn])
     columns = ["first view"]

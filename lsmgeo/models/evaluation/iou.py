@@ -47,7 +47,9 @@ def report_iou(contenders: Sequence[Contender], shapes: Shapes, options: Options
         Curve(name, places[: len(IOU[paper])], [Cell(number) for number in IOU[paper][:views]], True)
         for name, paper in _known(contenders).items()
     ]
-    picture = draw_curves(curves, title=f"Voxel IoU, {shapes.about}", across="views", up="mean IoU of categories [%]")
+    picture = draw_curves(
+        curves, title="Voxel IoU by number of views", data=shapes.about, across="views", up="mean IoU of categories [%]"
+    )
     return Report(
         "iou",
         [table, *classes],

@@ -70,7 +70,6 @@ def report_order(contenders: Sequence[Contender], shapes: Shapes, options: Optio
         )
         bars = [Cell(cells[count][0].value, cells[count][1].value / 2) for count in counts]  # drawn twice as long
         curves.append(Curve(contender.name, counts, bars))
-    title = f"IoU and its deviation over {options.orders} orders of the views, {shapes.about}"
     return Report(
         "order",
         tables,
@@ -80,7 +79,16 @@ def report_order(contenders: Sequence[Contender], shapes: Shapes, options: Optio
             for (name, count), one in scores.items()
             for shape in one.by_shape("mean, deviation, range, deviation of voxels, voxels that change")
         ],
-        {"order": draw_curves(curves, title=title, across="views", up="voxel IoU [%]")},
+        {
+            "order": draw_curves(
+                curves,
+                title=f"{options.orders} orders of the views",
+                data=shapes.about,
+                across="views",
+                up="voxel IoU [%]",
+                bars="deviation over the orders",
+            )
+        },
         notes=notes,
     )
 

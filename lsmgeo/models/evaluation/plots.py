@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from math import isnan
 from typing import NamedTuple
 
 from lsmgeo.models.evaluation.report import Cell
@@ -26,15 +27,24 @@ class Curve(NamedTuple):
     is_elsewhere: bool = False  # the paper's, of other data
 
 
-def draw_curves(curves: Sequence[Curve], *, title: str, across: str, up: str, lowest: float | None = None) -> bytes:
-    """Draw lines with bars of two standard errors up and down; those of other data are thin and broken.
+def draw_curves(
+    curves: Sequence[Curve],
+    *,
+    title: str,
+    data: str,
+    across: str,
+    up: str,
+    bars: str = "two standard errors",
+) -> bytes:
+    """Draw lines with bars of two errors up and down; those of other data are thin and broken.
 
     Args:
         curves: the lines; one of other data has the colour of the one of that name.
         title: to write above.
+        data: what was measured on, written below the title.
         across: what the places are, with units.
         up: what the values are, with units.
-        lowest: where the upward axis begins, by default where the values do.
+        bars: what the bars are, where there are any.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -52,16 +62,16 @@ def draw_curves(curves: Sequence[Curve], *, title: str, across: str, up: str, lo
                 curve.places, values, "--", color=shade, lw=1.0, alpha=0.7, label=f"{curve.name} (paper, ShapeNet)"
             )
             continue
-        bars = [0.0 if cell.error != cell.error else 2 * cell.error for cell in curve.cells]
+        reach = [0.0 if isnan(cell.error) else 2 * cell.error for cell in curve.cells]
         axes.errorbar(
-            curve.places, values, bars, marker="o", ms=4, lw=1.6, capsize=2, color=colour[curve.name], label=curve.name
+            curve.places, values, reach, marker="o", ms=4, lw=1.6, capsize=2, color=colour[curve.name], label=curve.name
         )
-    axes.set_title(title, fontsize=11)
+    has_bars = any(cell.error > 0 for curve in curves for cell in curve.cells)
+    figure.suptitle(title, fontsize=11)
+    axes.set_title(data + f"; bars: {bars}" * has_bars, fontsize=8, color="0.35", wrap=True)
     axes.set_xlabel(across)
     axes.set_ylabel(up)
     axes.set_xticks(sorted({place for curve in curves for place in curve.places}))
-    if lowest is not None:
-        axes.set_ylim(bottom=lowest)
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)

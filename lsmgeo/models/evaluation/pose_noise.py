@@ -61,13 +61,20 @@ def report_pose_noise(contenders: Sequence[Contender], shapes: Shapes, options: 
     columns = [f"{angle:g}°" for angle in angles]
     rows = [Row(name, one.cells(100)) for name, one in scores.items()]
     curves = [Curve(name, angles, one.cells(100)) for name, one in scores.items()]
-    title = f"Noisy poses, {views} views, {shapes.about}"
     return Report(
         "pose-noise",
         [Table("degrees", f"voxel IoU [%], {views} views, noise up to:", columns, rows)],
         facts_of(contenders, shapes, options, views=views, degrees=list(angles), threshold=options.threshold),
         joined(scores, "iou"),
-        {"pose-noise": draw_curves(curves, title=title, across="largest angle [degrees]", up="voxel IoU [%]")},
+        {
+            "pose-noise": draw_curves(
+                curves,
+                title=f"Noisy poses, {views} views",
+                data=shapes.about,
+                across="largest angle [degrees]",
+                up="voxel IoU [%]",
+            )
+        },
         notes=notes,
     )
 

@@ -55,7 +55,6 @@ def report_unseen(contenders: Sequence[Contender], shapes: Shapes, options: Opti
     categories = sorted(set(shapes.categories))
     of_categories = [Row(title, one.category_cells(views - 1, categories, 100)) for title, one in drops.items()]
     curves = [Curve(title, range(1, views + 1), one.cells(100)) for title, one in drops.items()]
-    title = f"IoU lost on unseen categories, {shapes.about}"
     return Report(
         "unseen",
         [
@@ -70,7 +69,15 @@ def report_unseen(contenders: Sequence[Contender], shapes: Shapes, options: Opti
         ],
         facts_of(contenders, shapes, options, views=views, threshold=options.threshold),
         joined(scores, "iou"),
-        {"unseen": draw_curves(curves, title=title, across="views", up="drop of IoU [points]")},
+        {
+            "unseen": draw_curves(
+                curves,
+                title="IoU lost on unseen categories",
+                data=shapes.about,
+                across="views",
+                up="drop of IoU [points]",
+            )
+        },
         notes=notes,
     )
 

@@ -136,10 +136,8 @@ def save_checkpoint(
     folder = Path(folder)
     step, keep = check_whole("save_checkpoint", "step", step, 0), check_whole("save_checkpoint", "keep", keep, 1)
     final = folder / step_folder(step)
-    files = {
-        WEIGHTS: encode_weights(model, about={"step": step, "training": dict(config)}),
-        STATE: _encode_state(state),
-    }
+    about = {"step": step, "training": json.loads(_canonical(config))}
+    files = {WEIGHTS: encode_weights(model, about=about), STATE: _encode_state(state)}
     files[META] = _encode_meta(files, step, config, best)
     try:
         make_folder(folder)

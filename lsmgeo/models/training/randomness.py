@@ -26,7 +26,8 @@ def seeded_generator(seed: int, *position: int) -> torch.Generator:
         >>> torch.rand(1, generator=first).item() == torch.rand(1, generator=second).item()
         True
     """
-    state = np.random.SeedSequence([seed, *position]).generate_state(1, np.uint64)
+    # With their number: zeros at the end of a sequence change nothing.
+    state = np.random.SeedSequence([len(position), seed, *position]).generate_state(1, np.uint64)
     return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
 
 

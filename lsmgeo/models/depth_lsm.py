@@ -103,7 +103,7 @@ class DepthLSM(Machine):
         self.settings = settings
         is_release = settings.variant == "release"
         planes = depth_planes(settings.near, settings.far, settings.planes)
-        channels, early = settings.output_channels, settings.encoder_channels
+        channels, early = self.grid_network.out_channels, settings.encoder_channels
         level = settings.map_stride.bit_length() - 2  # of the early map that has the swept maps' size
         self.sweep: PlaneSweepProject | ProjectReduce
         if is_release:

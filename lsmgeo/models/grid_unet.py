@@ -17,7 +17,7 @@ class GridUNet(nn.Module):
     """The fused grid to a grid of features, by convolutions down, transposed convolutions up, and skips.
 
     Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017, section 3, with the widths of their release.
-    On 32^3: 32 @ 16, 64 @ 8, 128 @ 4; up 64 @ 8, 32 @ 16, 32 @ 32. The output is normalised and not yet activated.
+    On 32^3: 32 @ 16, 64 @ 8, 128 @ 4; up 64 @ 8, 32 @ 16, 32 @ 32. The output, of `out_channels`, is not yet activated.
 
     Args:
         settings: of the machine.
@@ -32,6 +32,8 @@ class GridUNet(nn.Module):
 
     def __init__(self, settings: MachineSettings) -> None:
         super().__init__()
+        self.skip = settings.grid_skip
+        self.out_channels = settings.output_channels + (settings.hidden_channels if settings.grid_skip else 0)
         norm = "shift" if settings.variant == "release" else "scale"
         channels = (settings.hidden_channels, *settings.grid_channels)
         self.down = nn.ModuleList(
@@ -58,4 +60,4 @@ class GridUNet(nn.Module):
             x = block(x)
             if maps:
                 x = torch.cat((x, maps.pop()), 1)
-        return x
+        return torch.cat((x, grid), 1) if self.skip else x

@@ -14,17 +14,20 @@ _COMPACT: dict[str, Any] = {
     "grid_size": 16,
     "encoder_channels": (32, 64, 96),
     "grid_channels": (48, 96),
-    "output_channels": 24,
+    "feature_channels": 28,
     "feature_stride": 4,
+    "output_channels": 16,
+    "grid_skip": True,
 }
 _TINY: dict[str, Any] = {
     "image_size": 32,
     "grid_size": 8,
     "encoder_channels": (8, 12),
-    "grid_channels": (12, 16),
+    "grid_channels": (8, 12),
     "feature_channels": 8,
     "hidden_channels": 8,
     "output_channels": 8,
+    "grid_skip": True,
 }
 _COMPACT_R2N2: dict[str, Any] = {
     "image_size": 64,

@@ -30,7 +30,9 @@ class MachineSettings:
         fusion: "gru" or "lstm".
         hidden_channels: of the recurrence's state.
         grid_channels: of the grid network's levels; 64^3 grids take a fourth of 256.
-        output_channels: of the grid network's output.
+        output_channels: of the grid network's last layer.
+        grid_skip: whether the fused grid itself goes beside it; neither the paper nor the release has this skip, which
+            small networks need: it is the one way for detail of the grid's own size.
     """
 
     variant: str = "paper"
@@ -43,6 +45,7 @@ class MachineSettings:
     hidden_channels: int = 32
     grid_channels: tuple[int, ...] = (32, 64, 128)
     output_channels: int = 32
+    grid_skip: bool = False
 
     @property
     def image_stride(self) -> int:
@@ -55,6 +58,7 @@ class MachineSettings:
         check_choice(who, "fusion", self.fusion, ("gru", "lstm"))
         for name in ("feature_channels", "hidden_channels", "output_channels"):
             check_whole(who, name, getattr(self, name), 1, LARGEST_SIDE)
+        check_flag(who, "grid_skip", self.grid_skip)
         for name in ("encoder_channels", "grid_channels"):
             check_channels(who, name, getattr(self, name))
         check_whole(who, "image_size", self.image_size, 1, LARGEST_SIDE)

@@ -66,7 +66,9 @@ class VoxelLSM(Machine):
         is_release = settings.variant == "release"
         # One channel: the softmax of two classes is the sigmoid of their difference.
         parts = settings.upsample**3
-        self.out = Block(3, settings.output_channels, parts, 4 if is_release else 3, norm="none", transposed=is_release)
+        self.out = Block(
+            3, self.grid_network.out_channels, parts, 4 if is_release else 3, norm="none", transposed=is_release
+        )
         self.resolution = settings.grid_size * settings.upsample
         self.grid = VoxelGrid(self.resolution)
 

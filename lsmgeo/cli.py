@@ -86,7 +86,7 @@ def info(path: str, out: str = "lsmgeo-info") -> int:
 
 def reconstruct(
     scene: str,
-    method: Literal["sweep", "hull"] = "sweep",
+    method: Literal["sweep", "hull", "v-lsm", "d-lsm"] = "sweep",
     view: int | str | None = None,
     out: str = "lsmgeo-reconstruct",
     neighbours: int = 4,
@@ -104,14 +104,19 @@ def reconstruct(
     masks: str | None = None,
     background: str | None = None,
     memory: int = 1024,
+    weights: str | None = None,
+    views: int = 8,
+    box: str | None = None,
+    threshold: float = 0.4,
 ) -> int:
     """Reconstruct posed photographs: depth maps, coloured points, a mesh, and a page to turn it around in.
 
     Args:
         scene: posed photographs in any form that lsmgeo reads.
-        method: "sweep" is plane-sweep stereo, "hull" the visual hull of silhouettes.
+        method: "sweep" is plane-sweep stereo, "hull" the visual hull of silhouettes; "v-lsm" and "d-lsm" are learnt:
+            voxels, and depth maps.
         view: a photograph, its number (by name, from 0) or its name: sweep this one alone; a hull is looked at from
-            there. By default all are swept, checked against each other and fused.
+            there, and a learnt model reads it first. By default all are swept, checked against each other and fused.
         out: folder for the results; created where it does not exist.
         neighbours: for sweeps, number of other photographs to match with.
         size: longer side in pixels at which photographs are used.
@@ -127,11 +132,16 @@ def reconstruct(
         resolution: voxels along the longest side of the box in which the mesh is made.
         rule: for hulls, whether a voxel must lie in "all" silhouettes, or in three quarters of them ("mean"), which
             forgives wrong ones.
-        masks: for hulls, a folder of silhouettes; by default alpha, or a folder masks or silhouettes beside the
-            photographs.
-        background: for hulls, the colour behind the object, which then tells the silhouettes, whatever else could:
-            white, black, or three numbers such as 0.1,0.8,0.2.
+        masks: for hulls and learnt models, a folder of silhouettes; by default alpha, or a folder masks or silhouettes
+            beside the photographs.
+        background: for hulls and learnt models, the colour behind the object, which then tells the silhouettes,
+            whatever else could: white, black, or three numbers such as 0.1,0.8,0.2.
         memory: for sweeps, MiB that one may take.
+        weights: for learnt models, a file of weights, a checkpoint or a run folder of lsmgeo train.
+        views: for learnt models, how many photographs are used at most, from all around.
+        box: for learnt models, where the object is: x,y,z,side of a cube in world units; by default told from
+            silhouettes, sparse points or the cameras.
+        threshold: for v-lsm, the probability from which a voxel is solid.
 
     Returns:
         The exit status: 0, or 1 where nothing could be told.
@@ -145,15 +155,18 @@ def reconstruct(
     from lsmgeo.classical.outputs import write_results
     from lsmgeo.errors import OptionError
 
-    for option, value, of in (
-        ("masks", masks, "hull"),
-        ("background", background, "hull"),
-        ("near", near, "sweep"),
-        ("far", far, "sweep"),
-        ("density", density, "sweep"),
+    learnt = ("v-lsm", "d-lsm")
+    for option, value, methods in (
+        ("masks", masks, ("hull", *learnt)),
+        ("background", background, ("hull", *learnt)),
+        ("near", near, ("sweep",)),
+        ("far", far, ("sweep",)),
+        ("density", density, ("sweep",)),
+        ("weights", weights, learnt),
+        ("box", box, learnt),
     ):
-        if value is not None and method != of:
-            raise OptionError(f"{option} is for method {of}; got method {method}")
+        if value is not None and method not in methods:
+            raise OptionError(f"{option} is for method {', '.join(methods)}; got method {method}")
     start = time.perf_counter()
     images = data.open(scene)
     name = images.names[view] if isinstance(view, int) and 0 <= view < len(images) else view
@@ -178,6 +191,23 @@ def reconstruct(
             reference,
             title,
             rule=rule,
+            masks=masks,
+            background=background,
+            resolution=resolution,
+            size=size,
+        )
+    elif method in learnt:
+        from lsmgeo.models.reconstructing import learnt_results
+
+        results = learnt_results(
+            images,
+            reference,
+            f"{Path(scene).resolve().name}, {method.upper()}{seen}",
+            method=method,
+            weights=weights,
+            views=views,
+            box=box,
+            threshold=threshold,
             masks=masks,
             background=background,
             resolution=resolution,
@@ -405,12 +435,21 @@ def _run(arguments: Sequence[str] | None) -> int:
 
     from jsonargparse import auto_cli
 
+    from lsmgeo.models.commands import evaluate
+
     try:
         release = version("lsmgeo")
     except PackageNotFoundError:
         from lsmgeo import __version__ as release
     status = auto_cli(
-        {"demo": demo, "info": info, "reconstruct": reconstruct, "convert": convert, "render": render},
+        {
+            "demo": demo,
+            "info": info,
+            "reconstruct": reconstruct,
+            "convert": convert,
+            "render": render,
+            "evaluate": evaluate,
+        },
         args=None if arguments is None else list(arguments),
         as_positional=True,
         prog="lsmgeo",

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from lsmgeo.classical.surface import SurfaceMesh
     from lsmgeo.data import PosedImages
 
-__all__ = ["hull_results", "readable", "sweep_results"]
+__all__ = ["hull_results", "named_colour", "readable", "sweep_results"]
 
 MOST_NAMED = 5
 # Kept pixels below this fraction are worth a word.
@@ -175,14 +175,7 @@ def hull_results(
         OptionError: no silhouettes are there, or they have no hull.
         DataError: a photograph or a mask cannot be read.
     """
-    colour: Any = background
-    if background is not None and "," in background:
-        try:
-            colour = tuple(float(part) for part in background.split(","))
-        except ValueError:
-            raise OptionError(
-                f"background must be black, white or three numbers such as 0.1,0.8,0.2; got {background!r}"
-            ) from None
+    colour = named_colour(background)
     try:
         hull = reconstruct_hull(
             scene, rule=rule, folder=masks, background=colour, resolution=resolution, size=size, progress=True
@@ -212,6 +205,18 @@ def hull_results(
     ordered = sorted(hull.views, key=lambda one: one.view != view) if view is not None else hull.views
     nothing = np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8)
     return Results(title, tuple(facts), tuple(notes), tuple(map(_looked_at_hull, ordered)), *nothing, hull.mesh)
+
+
+def named_colour(background: str | None) -> str | tuple[float, ...] | None:
+    """A colour as `lsmgeo.classical.silhouettes` takes it, of a name or of three numbers with commas between."""
+    if background is None or "," not in background:
+        return background
+    try:
+        return tuple(float(part) for part in background.split(","))
+    except ValueError:
+        raise OptionError(
+            f"background must be black, white or three numbers such as 0.1,0.8,0.2; got {background!r}"
+        ) from None
 
 
 def _some(reasons: list[str]) -> str:

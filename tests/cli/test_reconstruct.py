@@ -215,7 +215,7 @@ def test_results_never_replace_the_photographs(scene, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--method", "sweep", "--masks", "x"], "masks is for method hull; got method sweep"),
+        (["--method", "sweep", "--masks", "x"], "masks is for method hull, v-lsm, d-lsm; got method sweep"),
         (["--method", "hull", "--near", "1"], "near is for method sweep; got method hull"),
         (["--method", "hull", "--background", "0.1,x,2"], "background must be black, white or three numbers"),
         (["--resolution", "2"], "resolution must be"),

@@ -1,0 +1,90 @@
+"""Steps that are not finite are counted, named, and end the training where they are too many (F6)."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from lsmgeo.errors import OptionError, TrainingError
+from lsmgeo.models.training.guard import StepGuard, are_finite
+
+
+def test_are_finite_looks_at_every_number():
+    assert are_finite()
+    assert are_finite(0.0, torch.tensor(3.0), torch.tensor([1e30]))
+    for bad in (math.nan, math.inf, -math.inf, torch.tensor(math.nan), torch.tensor(math.inf, dtype=torch.bfloat16)):
+        assert not are_finite(1.0, bad)
+
+
+def test_one_bad_gradient_would_poison_adam_for_good():
+    """Why there is a guard."""
+    weights = torch.nn.Parameter(torch.ones(2))
+    optimiser = torch.optim.Adam([weights])
+    for gradient in (math.nan, 1.0, 1.0):
+        weights.grad = torch.full((2,), gradient)
+        optimiser.step()
+    assert weights.isnan().all()
+
+
+def test_good_steps_are_taken_and_bad_ones_not():
+    guard = StepGuard()
+    assert [guard.admits(step, is_bad=step == 3) for step in range(1, 6)] == [True, True, False, True, True]
+    assert guard.state_dict() == {"steps": 5, "skipped": 1, "in_a_row": 0}
+
+
+def test_three_in_a_row_end_it_and_are_named():
+    guard = StepGuard(in_a_row=3)
+    for step, bad in enumerate([True, True, False, True, True], 1):
+        guard.admits(step, is_bad=bad, names=(f"chair-{step}", "lamp-0"))
+    with pytest.raises(
+        TrainingError, match=r"in 3 steps in succession.* unharmed.*4 with chair-4, lamp-0.*6 with bed-6$"
+    ):
+        guard.admits(6, is_bad=True, names=("bed-6",))
+
+
+@pytest.mark.parametrize(("share", "minimum", "ends_at"), [(0.001, 5, 12), (0.25, 0, 2), (1.0, 0, None), (0.0, 0, 2)])
+def test_a_larger_share_of_all_steps_ends_it(share, minimum, ends_at):
+    """Every second step is bad: of 12, the sixth, which is the first above the minimum of 5."""
+    guard = StepGuard(share=share, minimum=minimum)
+    ended = None
+    for step in range(1, 100):
+        try:
+            guard.admits(step, is_bad=step % 2 == 0)
+        except TrainingError:
+            ended = step
+            break
+    assert ended == ends_at
+
+
+def test_rare_ones_are_forgiven_over_a_long_run():
+    guard = StepGuard()
+    for step in range(1, 20_001):
+        guard.admits(step, is_bad=step % 1001 == 0)
+    assert guard.state_dict()["skipped"] == 19
+
+
+def test_a_scaler_that_looks_for_its_scale_is_not_counted():
+    guard = StepGuard(in_a_row=2)
+    assert not any(guard.admits(step, is_bad=True, scale=65536.0 / 2**step) for step in range(10))
+    assert guard.state_dict()["skipped"] == 0
+    guard.admits(10, is_bad=True, scale=1.0)
+    with pytest.raises(TrainingError, match="2 steps in succession"):
+        guard.admits(11, is_bad=True, scale=0.5)
+
+
+def test_a_resumed_run_goes_on_counting():
+    guard, resumed = StepGuard(in_a_row=2), StepGuard(in_a_row=2)
+    guard.admits(1, is_bad=True)
+    resumed.load_state_dict(guard.state_dict())
+    with pytest.raises(TrainingError):
+        resumed.admits(2, is_bad=True)
+    # The state was copied.
+    assert guard.state_dict()["steps"] == 1
+
+
+@pytest.mark.parametrize("options", [{"in_a_row": 0}, {"share": -0.1}, {"share": 2.0}, {"minimum": -1}])
+def test_impossible_options_are_refused(options):
+    with pytest.raises(OptionError, match=next(iter(options))):
+        StepGuard(**options)

@@ -129,10 +129,12 @@ def dynamic_shapes():
     return ({0: scenes, 1: count},) * 5
 
 
+@pytest.mark.timeout(600)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
 @pytest.mark.parametrize("name", ONE_SOON_ALL_LATER)
-def test_export(name):
-    """A program for any number of scenes and views, through its file and back."""
-    model = ThereAndBack(**UNPROJECTIONS[name])
+def test_export_and_onnx(name, tmp_path):
+    """A program for any number of scenes and views, through its file and back; and the same program as ONNX."""
+    model = ThereAndBack(**UNPROJECTIONS[name]).eval()
     program = torch.export.export(model, arguments(2, 3), dynamic_shapes=dynamic_shapes())
     file = io.BytesIO()
     torch.export.save(program, file)
@@ -141,6 +143,16 @@ def test_export(name):
     for size in SIZES:
         given = arguments(*size, seed=3)
         assert_same(loaded(*given), model(*given))
+
+    onnxruntime = pytest.importorskip("onnxruntime", reason="the onnx extra is not installed")
+    pytest.importorskip("onnxscript", reason="the onnx extra is not installed")
+    torch.onnx.export(program, dynamo=True, opset_version=20, verbose=False).save(tmp_path / "model.onnx")
+    session = onnxruntime.InferenceSession(str(tmp_path / "model.onnx"), providers=["CPUExecutionProvider"])
+    names = [item.name for item in session.get_inputs()]
+    for size in ((2, 3), *SIZES):
+        given = arguments(*size, seed=5)
+        answers = session.run(None, {key: tensor.numpy() for key, tensor in zip(names, given, strict=True)})
+        assert_same([torch.from_numpy(answer) for answer in answers], model(*given), tolerance=1e-4)
 
 
 def test_cameras_are_a_pytree():
@@ -153,21 +165,3 @@ def test_cameras_are_a_pytree():
     program = torch.export.export(Layer(), (features, cameras))
     actual, expected = program.module()(features, cameras), Layer()(features, cameras)
     torch.testing.assert_close(tuple(actual), tuple(expected))
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
-@pytest.mark.parametrize("name", ONE_SOON_ALL_LATER)
-def test_onnx(name, tmp_path):
-    onnxruntime = pytest.importorskip("onnxruntime", reason="the onnx extra is not installed")
-    pytest.importorskip("onnxscript", reason="the onnx extra is not installed")
-    model = ThereAndBack(**UNPROJECTIONS[name]).eval()
-    program = torch.onnx.export(
-        model, arguments(2, 3), dynamo=True, dynamic_shapes=dynamic_shapes(), opset_version=20, verbose=False
-    )
-    program.save(tmp_path / "model.onnx")
-    session = onnxruntime.InferenceSession(str(tmp_path / "model.onnx"), providers=["CPUExecutionProvider"])
-    names = [item.name for item in session.get_inputs()]
-    for size in ((2, 3), (1, 1), (1, 4), (4, 5)):
-        given = arguments(*size, seed=5)
-        answers = session.run(None, {key: tensor.numpy() for key, tensor in zip(names, given, strict=True)})
-        assert_same([torch.from_numpy(answer) for answer in answers], model(*given), tolerance=1e-4)

@@ -97,7 +97,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         options.shapes, options.views, options.size, options.passes = 8, 4, 64, 1
     where = timing.machine("cpu")
     with tempfile.TemporaryDirectory() as folder:
-        made = render_set("synthetic-13", folder, Recipe(views=options.views, size=options.size), shapes=options.shapes)
+        recipe = Recipe(views=options.views, size=options.size)
+        jobs = 1 if options.quick else -1  # workers take longer to start than eight shapes to draw
+        made = render_set("synthetic-13", folder, recipe, shapes=options.shapes, jobs=jobs)
         size = sum(path.stat().st_size for path in made.shards) / made.shapes
         cases = measure(Path(folder), options)
     columns = {"case": "", "rate": ".0f", "slowest": ".0f", "fastest": ".0f", "target": ".0f"}

@@ -307,7 +307,8 @@ def test_an_interrupt_leaves_no_file(scene, tmp_path, monkeypatch, capsys, place
 
     monkeypatch.setattr(place, interrupt)
     out = tmp_path / "out"
-    assert cli.main(["reconstruct", str(folder), "--planes", "8", "--out", str(out)]) == 130
+    small = ["--planes", "8", "--size", "48", "--resolution", "32"]
+    assert cli.main(["reconstruct", str(folder), *small, "--out", str(out)]) == 130
     assert capsys.readouterr().err.endswith("lsmgeo: interrupted\n")
     assert list(out.rglob("*")) == []
 

@@ -1,4 +1,4 @@
-"""The command line: demo, info, reconstruct, convert, render. Heavy imports wait until a command runs."""
+"""The command line: scenes, training sets, models. Heavy imports wait until a command runs."""
 
 from __future__ import annotations
 
@@ -435,7 +435,7 @@ def _run(arguments: Sequence[str] | None) -> int:
 
     from jsonargparse import auto_cli
 
-    from lsmgeo.models.commands import evaluate
+    from lsmgeo.models.commands import evaluate, train
 
     try:
         release = version("lsmgeo")
@@ -448,9 +448,11 @@ def _run(arguments: Sequence[str] | None) -> int:
             "reconstruct": reconstruct,
             "convert": convert,
             "render": render,
+            "train": train,
             "evaluate": evaluate,
         },
-        args=None if arguments is None else list(arguments),
+        # jsonargparse appends to a list with "+"; that an option is given again and again is how others do it.
+        args=[re.sub(r"^--set(?==|$)", "--set+", word) for word in (sys.argv[1:] if arguments is None else arguments)],
         as_positional=True,
         prog="lsmgeo",
         version=release,

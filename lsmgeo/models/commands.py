@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Literal
 
-__all__ = ["evaluate"]
+__all__ = ["evaluate", "train"]
 
 
 def evaluate(
@@ -109,3 +109,37 @@ def evaluate(
     for note in made.notes:
         print(f"lsmgeo: warning: {note}", file=sys.stderr)
     return 0
+
+
+def train(config: str, out: str = "lsmgeo-run", set: list[str] | None = None, quiet: bool = False) -> int:
+    """Train a model, or go on where a run stopped; on several devices with torchrun, see the guide.
+
+    Args:
+        config: a TOML or JSON file; examples/configs holds some.
+        out: the run's folder, for checkpoints, the log and pictures; where it holds a run already, that goes on.
+        set: a setting that comes before the file's, such as --set run.steps=100; may be given again and again.
+        quiet: whether to show no progress.
+
+    Returns:
+        The exit status: 0, or 143 after SIGTERM, when everything was saved and the same command goes on.
+    """
+    from pathlib import Path
+
+    from lsmgeo.models import training
+
+    trained = training.train(training.read_config(config, set or ()), out, quiet=quiet)
+    if trained.is_first:
+        why = {"steps": "all its steps are taken", "minutes": "its time is over", "stop": "it was asked to"}
+        print(f"ended:       at step {trained.step}, since {why[trained.ended]}")
+        if trained.evaluation is not None:
+            found = trained.evaluation
+            values = ", ".join(f"{value:.4f}" for value in found.by_view.values())
+            print(f"{found.measure.replace('_', ' ') + ':':<13}{values} after 1 to {len(found.by_view)} views")
+        print(f"checkpoint:  {trained.checkpoint.resolve()}")
+        if trained.best not in (None, trained.step):
+            print(f"best:        {trained.checkpoint.with_name(f'step_{trained.best:08d}').resolve()}")
+        print(f"log:         {(Path(out) / 'log.jsonl').resolve()}; tensorboard --logdir {Path(out).resolve()}")
+        print(f"evaluate:    lsmgeo evaluate {trained.checkpoint}")
+        if trained.ended == "stop":
+            print("go on:       the same command")
+    return trained.exit_code

@@ -1,1 +1,24 @@
-"""Training that loses no work."""
+"""Training: a loop that is read from top to bottom, what it is configured with and fed with, and what it keeps."""
+
+from lsmgeo.models.training.config import (
+    DataConfig,
+    ModelConfig,
+    OptimiserConfig,
+    RunConfig,
+    TrainingConfig,
+    make_config,
+    read_config,
+)
+from lsmgeo.models.training.loop import Trained, train
+
+__all__ = [
+    "DataConfig",
+    "ModelConfig",
+    "OptimiserConfig",
+    "RunConfig",
+    "Trained",
+    "TrainingConfig",
+    "make_config",
+    "read_config",
+    "train",
+]

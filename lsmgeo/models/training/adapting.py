@@ -1,0 +1,82 @@
+"""What happens to a sample of shards before a model sees it: another size of images, noise in its poses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from lsmgeo import cameras as camera_tools
+from lsmgeo.cameras import CameraTensors
+from lsmgeo.data import Sample
+
+__all__ = ["AdaptedShapes", "resize_sample", "turn_cameras"]
+
+# The last number of the seed that pose noise is drawn from, unlike any number of another draw.
+NOISE = 0x706F7365
+
+
+class AdaptedShapes(Dataset[Sample]):
+    """Samples of shards at the size of the model's images, their cameras turned a little where noise is asked for."""
+
+    def __init__(self, dataset: Dataset[Any], size: int, noise: float, seed: int, length: int) -> None:
+        self.dataset, self.size, self.noise, self.seed, self.length = dataset, size, noise, seed, length
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, item: tuple[int, int]) -> Sample:
+        sample = resize_sample(self.dataset[item], self.size)
+        return sample._replace(cameras=turn_cameras(sample.cameras, self.noise, self.seed, *item))
+
+
+def turn_cameras(cameras: CameraTensors, degrees: float, seed: int, epoch: int, index: int) -> CameraTensors:
+    """Cameras turned about the object by up to so many degrees, always the same for a seed, an epoch and an index."""
+    if degrees == 0:
+        return cameras
+    state = np.random.SeedSequence([seed, epoch, index, NOISE]).generate_state(1, np.uint64)
+    generator = torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
+    return camera_tools.perturb(cameras, degrees, generator=generator)
+
+
+def resize_sample(sample: Sample, size: int) -> Sample:
+    """A sample with square images of another size, each new pixel the mean of the area that it covers.
+
+    Depth is the mean over the object's part of the area, and the object is what covers half of it or more.
+
+    Args:
+        sample: of any image size.
+        size: height and width in pixels.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.cameras import orbit
+        >>> cameras = orbit(torch.zeros(1), 10.0, 2.0, focal_length=90.0, height=4, width=4)
+        >>> depth = torch.tensor([[0.0, 0.0, 2.0, 2.0], [0.0, 0.0, 2.0, 4.0]]).repeat(2, 1)[None]
+        >>> sample = Sample(torch.rand(1, 3, 4, 4), cameras, depth, depth > 0, None, None, None, "step")
+        >>> resize_sample(sample, 2).depth
+        tensor([[[0.0000, 2.5000],
+                 [0.0000, 2.5000]]])
+    """
+    if tuple(sample.images.shape[2:]) == (size, size):
+        return sample
+    mask, depth, share = sample.mask, sample.depth, None
+    if mask is None and depth is not None:
+        mask = depth > 0
+    if mask is not None:
+        share = _averaged(mask.float(), size)
+        if depth is not None:
+            depth = torch.where(share >= 0.5, _averaged(depth * mask, size) / share.clamp_min(1e-6), 0.0)
+    return sample._replace(
+        images=torch.nn.functional.interpolate(sample.images, (size, size), mode="area"),
+        cameras=camera_tools.resize(sample.cameras, size, size),
+        depth=depth,
+        mask=None if sample.mask is None or share is None else share >= 0.5,
+    )
+
+
+def _averaged(maps: Tensor, size: int) -> Tensor:
+    return torch.nn.functional.interpolate(maps[:, None], (size, size), mode="area")[:, 0]

@@ -1,0 +1,378 @@
+"""The configuration of a training run: four groups of settings, from a TOML or JSON file and from ``key=value``."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+import tomllib
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from lsmgeo._checks import check_choice, check_flag, check_number, check_whole, describe
+from lsmgeo.data.files import read_text
+from lsmgeo.errors import DataError, OptionError
+
+__all__ = ["DataConfig", "ModelConfig", "OptimiserConfig", "RunConfig", "TrainingConfig", "make_config", "read_config"]
+
+MAX_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig:
+    """Which network; see `lsmgeo.models.create`.
+
+    Attributes:
+        name: "voxel-lsm", "depth-lsm", "r2n2" or "r2n2-pose".
+        preset: "paper", "compact" or "tiny".
+        variant: "paper" or "release".
+        settings: what differs from the preset, as `create` takes it.
+        weights: a file of weights to begin with (`lsmgeo.models.load`) whose model is of the same settings, or None.
+    """
+
+    name: str = "voxel-lsm"
+    preset: str = "compact"
+    variant: str = "paper"
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    weights: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataConfig:
+    """What is trained on.
+
+    Attributes:
+        source: a folder of shards (``lsmgeo render``, ``lsmgeo convert``), or "synthetic-13", which is rendered as it
+            is needed, on the device that trains.
+        shapes: of synthetic-13, the number of shapes in the set, before it is split.
+        set_seed: of synthetic-13, which set.
+        pool: of synthetic-13, the number of different views that a shape has.
+        views: how many views of a shape the model is given, in random order; (low, high) for a random number of them.
+        background: "white", an RGB colour in [0, 1], "random", or a folder of pictures.
+        categories: "all", "first" or "second" (the halves of the experiment with unseen classes), or names.
+        split: the part of the set that is trained on.
+        validation_split: the part that is evaluated on.
+        validation_categories: as `categories`; None for the same.
+        limit: at most so many shapes of each part; None for all.
+        pose_noise: cameras are turned about the object by up to so many degrees, in training only.
+        workers: processes that read ahead; 0 reads in the training loop.
+        on_error: "raise" at a shape that cannot be read, or "skip" it, see `lsmgeo.data.ShapeDataset`.
+        max_bad_fraction: the share of such shapes that "skip" puts up with.
+    """
+
+    source: str = "synthetic-13"
+    shapes: int = 5200
+    set_seed: int = 0
+    pool: int = 20
+    views: int | tuple[int, int] = 4
+    background: str | tuple[float, float, float] = "white"
+    categories: str | tuple[str, ...] = "all"
+    split: str = "train"
+    validation_split: str = "val"
+    validation_categories: str | tuple[str, ...] | None = None
+    limit: int | None = None
+    pose_noise: float = 0.0
+    workers: int = 1
+    on_error: str = "raise"
+    max_bad_fraction: float = 0.001
+
+    def __post_init__(self) -> None:
+        for name, least in (("shapes", 1), ("set_seed", 0), ("pool", 1), ("workers", 0)):
+            check_whole("data", name, getattr(self, name), least, 2**32 - 1)
+        low, high = self.view_range
+        if not 1 <= check_whole("data", "views", low, 1) <= check_whole("data", "views", high, 1):
+            raise OptionError(f"data: views must be a number or [low, high], low <= high; got {self.views!r}")
+        if self.limit is not None:
+            check_whole("data", "limit", self.limit, 1)
+        if self.source == "synthetic-13" and high > self.pool:
+            raise OptionError(f"data: views must be at most data.pool = {self.pool}; got {self.views!r}")
+        check_choice("data", "on_error", self.on_error, ("raise", "skip"))
+        if not 0 <= check_number("data", "pose_noise", self.pose_noise, "degrees") <= 180:
+            raise OptionError(f"data: pose_noise must be degrees from 0 to 180; got {self.pose_noise!r}")
+        if not 0 <= check_number("data", "max_bad_fraction", self.max_bad_fraction, "a share in [0, 1]") <= 1:
+            raise OptionError(f"data: max_bad_fraction must be a share in [0, 1]; got {self.max_bad_fraction!r}")
+
+    @property
+    def view_range(self) -> tuple[int, int]:
+        """The least and the largest number of views."""
+        return self.views if isinstance(self.views, tuple) else (self.views, self.views)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptimiserConfig:
+    """Adam, and how large its steps are.
+
+    Attributes:
+        learning_rate: of Adam.
+        betas: of Adam.
+        weight_decay: of AdamW; 0 is Adam.
+        schedule: "constant", or "cosine", down to 0 at ``run.steps``.
+        warm_up: the learning rate grows linearly over so many steps.
+        clip_norm: gradients of a larger norm are scaled down to it; None never.
+    """
+
+    learning_rate: float = 1e-3
+    betas: tuple[float, float] = (0.9, 0.999)
+    weight_decay: float = 0.0
+    schedule: str = "constant"
+    warm_up: int = 0
+    clip_norm: float | None = None
+
+    def __post_init__(self) -> None:
+        check_choice("optimiser", "schedule", self.schedule, ("constant", "cosine"))
+        check_whole("optimiser", "warm_up", self.warm_up, 0)
+        for name in ("learning_rate", "clip_norm"):
+            value = getattr(self, name)
+            if value is not None and not check_number("optimiser", name, value, "a positive number") > 0:
+                raise OptionError(f"optimiser: {name} must be a positive number; got {value!r}")
+        if not check_number("optimiser", "weight_decay", self.weight_decay, "a number, at least 0") >= 0:
+            raise OptionError(f"optimiser: weight_decay must be a number, at least 0; got {self.weight_decay!r}")
+        if not all(0 <= check_number("optimiser", "betas", beta, "two numbers in [0, 1)") < 1 for beta in self.betas):
+            raise OptionError(f"optimiser: betas must be two numbers in [0, 1); got {self.betas!r}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """How long, how, and what is kept.
+
+    Attributes:
+        steps: the run ends after so many steps; None for no such end.
+        minutes: or after so many minutes of training, over all resumes; None for no such end.
+        seed: of the weights, of the order of the shapes and of their views.
+        batch: shapes that a process takes at once.
+        accumulation: batches whose gradients make one step: a step takes batch x accumulation x processes shapes.
+        device: "auto" takes a GPU where there is one; "cpu".
+        precision: "no", "bf16" or "fp16": what is computed in fewer bits (weights stay float32).
+        channels_last: whether feature maps are kept pixel by pixel in memory.
+        loss_views: the loss is taken after "every" view, after a "random" one, or after the "last" alone.
+        region: of depth, the pixels of the loss: the "object", or "all" with the background far away.
+        evaluate_every: steps between evaluations; the end is always evaluated.
+        evaluate_shapes: how many shapes of the validation split are evaluated on, always the same.
+        evaluate_views: how many views of each, always the same; None for the most that the model trains on.
+        pictures: how many of these shapes are drawn at each evaluation.
+        checkpoint_every: steps between checkpoints; the end is always saved.
+        keep: how many checkpoints are kept, besides the best.
+        log_every: steps between lines of the log.
+        tensorboard: whether to write for TensorBoard too.
+        max_bad_steps: the run stops after so many steps in a row whose loss or gradient is not finite.
+        max_bad_fraction: and where more than this share of all steps was.
+    """
+
+    steps: int | None = None
+    minutes: float | None = None
+    seed: int = 0
+    batch: int = 4
+    accumulation: int = 1
+    device: str = "auto"
+    precision: str = "no"
+    channels_last: bool = False
+    loss_views: str = "every"
+    region: str = "object"
+    evaluate_every: int = 500
+    evaluate_shapes: int = 52
+    evaluate_views: int | None = None
+    pictures: int = 4
+    checkpoint_every: int = 500
+    keep: int = 3
+    log_every: int = 10
+    tensorboard: bool = True
+    max_bad_steps: int = 3
+    max_bad_fraction: float = 0.001
+
+    def __post_init__(self) -> None:
+        least = {"seed": 0, "pictures": 0}
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if "int" in str(item.type) and not (value is None and "None" in str(item.type)):
+                check_whole("run", item.name, value, least.get(item.name, 1))
+        for name, choices in (
+            ("device", ("auto", "cpu")),
+            ("precision", ("no", "bf16", "fp16")),
+            ("loss_views", ("every", "random", "last")),
+            ("region", ("object", "all")),
+        ):
+            check_choice("run", name, getattr(self, name), choices)
+        for name in ("channels_last", "tensorboard"):
+            check_flag("run", name, getattr(self, name))
+        if self.minutes is not None and not check_number("run", "minutes", self.minutes, "a positive number") > 0:
+            raise OptionError(f"run: minutes must be a positive number; got {self.minutes!r}")
+        if not 0 <= check_number("run", "max_bad_fraction", self.max_bad_fraction, "a share in [0, 1]") <= 1:
+            raise OptionError(f"run: max_bad_fraction must be a share in [0, 1]; got {self.max_bad_fraction!r}")
+        if self.steps is None and self.minutes is None:
+            raise OptionError("run: steps or minutes must say when the run ends; got neither")
+
+
+# What a resumed run may do otherwise than before: nothing of it changes what is learnt from a step.
+FREE = (
+    *("data.source", "data.workers", "data.on_error", "data.max_bad_fraction", "model.weights"),
+    *("run.steps", "run.minutes", "run.device", "run.evaluate_every", "run.evaluate_shapes", "run.evaluate_views"),
+    *("run.pictures", "run.checkpoint_every", "run.keep", "run.log_every", "run.tensorboard", "run.max_bad_steps"),
+    "run.max_bad_fraction",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingConfig:
+    """All settings of a run; equal settings on one machine give equal weights.
+
+    Attributes:
+        model: which network.
+        data: what it is trained on.
+        optimiser: Adam, and how large its steps are.
+        run: how long, how, and what is kept.
+
+    Example:
+        >>> config = TrainingConfig(model=ModelConfig(preset="tiny"), run=RunConfig(steps=100))
+        >>> config.optimiser.learning_rate, config.data.views
+        (0.001, 4)
+    """
+
+    model: ModelConfig = field(default_factory=ModelConfig)
+    data: DataConfig = field(default_factory=DataConfig)
+    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
+    run: RunConfig
+
+    def __post_init__(self) -> None:
+        if self.optimiser.schedule == "cosine" and self.run.steps is None:
+            raise OptionError("run: steps must be given with optimiser.schedule = 'cosine', which ends there; got None")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as JSON holds them."""
+        return json.loads(json.dumps(asdict(self)))
+
+    def free(self) -> tuple[str, ...]:
+        """The settings that may change when a run is resumed, by their dotted names."""
+        # The learning rate of a cosine depends on where it ends.
+        is_fixed = self.optimiser.schedule == "cosine"
+        return tuple(name for name in FREE if not (is_fixed and name == "run.steps"))
+
+
+GROUPS = {"model": ModelConfig, "data": DataConfig, "optimiser": OptimiserConfig, "run": RunConfig}
+
+
+def make_config(values: Mapping[str, Any]) -> TrainingConfig:
+    """A configuration from nested mappings, as TOML and JSON give them.
+
+    Args:
+        values: groups "model", "data", "optimiser", "run", each a mapping; what is missing takes its default.
+
+    Raises:
+        OptionError: a key that there is not, with the nearest that there is; a value of the wrong kind or out of range.
+
+    Example:
+        >>> make_config({"run": {"stepz": 100}})
+        Traceback (most recent call last):
+        lsmgeo.errors.OptionError: there is no run.stepz; did you mean run.steps?
+    """
+    if not isinstance(values, Mapping):
+        raise OptionError(f"a configuration must be a table of groups; got {describe(values)}")
+    known = [f"{group}.{item.name}" for group, form in GROUPS.items() for item in fields(form)]
+    groups = {}
+    for group, content in values.items():
+        if group not in GROUPS:
+            raise OptionError(f"there is no group {group!r}{_nearest(group, [*GROUPS, *known])}")
+        if not isinstance(content, Mapping):
+            raise OptionError(f"{group} must be a table of settings; got {describe(content)}")
+        hints = get_type_hints(GROUPS[group])
+        for key in content:
+            if key not in hints:
+                raise OptionError(f"there is no {group}.{key}{_nearest(f'{group}.{key}', known)}")
+        groups[group] = GROUPS[group](
+            **{key: _converted(f"{group}.{key}", value, hints[key]) for key, value in content.items()}
+        )
+    if "run" not in groups:
+        groups["run"] = RunConfig()  # says that steps or minutes are missing
+    return TrainingConfig(**groups)
+
+
+def read_config(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> TrainingConfig:
+    """Read the configuration of a run.
+
+    Args:
+        path: a TOML or JSON file with the tables model, data, optimiser and run.
+        overrides: settings that come before the file's, such as "run.steps=100" or "data.views=[1,4]"; "none" for None.
+
+    Raises:
+        DataError: the file cannot be read, or is no configuration.
+        OptionError: an override that is none.
+    """
+    path = Path(path)
+    text = read_text(path, MAX_BYTES)
+    try:
+        values = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+        if not isinstance(values, Mapping):
+            raise OptionError(f"a configuration must be a table of groups; got {describe(values)}")
+        config = None if overrides else make_config(values)
+    except (ValueError, RecursionError) as error:  # OptionError is one
+        raise DataError(path, str(error)) from error
+    if config is not None:
+        return config
+    changed = {group: dict(content) if isinstance(content, Mapping) else content for group, content in values.items()}
+    for override in overrides:
+        key, equals, text = override.partition("=")
+        group, dot, name = key.strip().partition(".")
+        if not equals or not dot:
+            raise OptionError(f"an override must be group.key=value, such as run.steps=100; got {override!r}")
+        table = changed.setdefault(group, {})
+        if name.startswith("settings.") and group == "model" and isinstance(table, dict):
+            table["settings"] = table = dict(table.get("settings", {}))
+            name = name.removeprefix("settings.")
+        if isinstance(table, dict):
+            table[name] = _parsed(text.strip())
+    try:
+        return make_config(changed)
+    except OptionError as error:
+        raise OptionError(f"{path} with {', '.join(overrides)}: {error}") from error
+
+
+def _parsed(text: str) -> Any:
+    """A value as TOML writes it; what TOML does not understand is text."""
+    if text.lower() == "none":
+        return None
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (tomllib.TOMLDecodeError, KeyError):
+        return text
+
+
+def _nearest(key: str, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(key, known, 1, 0.6)
+    if not near:  # the right name in the wrong group
+        near = [name for name in known if name.rpartition(".")[2] == key.rpartition(".")[2]]
+    return f"; did you mean {near[0]}?" if near else f"; there are {', '.join(known)}"
+
+
+def _converted(key: str, value: Any, hint: Any) -> Any:
+    """A value of JSON or TOML as the kind of a setting: lists become tuples, whole numbers real ones."""
+    kinds = get_args(hint) if get_origin(hint) in (types.UnionType, Union) else (hint,)
+    for kind in kinds:
+        origin = get_origin(kind) or kind
+        if origin is tuple and isinstance(value, list | tuple):
+            inner = get_args(kind)
+            inner = inner[:1] * len(value) if inner[-1] is Ellipsis else inner
+            if len(inner) == len(value):
+                return tuple(_converted(key, one, of) for one, of in zip(value, inner, strict=True))
+        elif origin is float and isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+        elif origin is Mapping and isinstance(value, Mapping):
+            return dict(value)
+        elif origin is bool or not isinstance(value, bool):
+            if origin is type(None):
+                if value is None:
+                    return None
+            elif isinstance(origin, type) and isinstance(value, origin):
+                return value
+    raise OptionError(f"{key} must be {' or '.join(map(_spelt, kinds))}; got {describe(value)}")
+
+
+def _spelt(kind: Any) -> str:
+    names = {int: "a whole number", float: "a number", str: "text", bool: "true or false", type(None): "none"}
+    if kind in names:
+        return names[kind]
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is tuple:
+        return f"a list of {_spelt(inner[0])}" if inner[-1] is Ellipsis else f"a list of {len(inner)} numbers"
+    return "a table"

@@ -1,0 +1,129 @@
+"""How good a model is in the middle of its training: always the same shapes, with always the same views."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import nn
+
+from lsmgeo.cameras import CameraTensors
+from lsmgeo.data import Batch, Sample
+from lsmgeo.metrics import DepthError, VoxelIoU
+from lsmgeo.models.losses import sum_loss
+from lsmgeo.models.training.pictures import Example
+from lsmgeo.models.training.processes import any_true, gather
+from lsmgeo.models.training.signals import StopRequest
+
+__all__ = ["Evaluation", "evaluate_model"]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What an evaluation found.
+
+    Attributes:
+        measure: "iou" (at 0.4, of voxels) or "depth_error" (median, world units).
+        by_view: the mean of the categories after 1 to V views.
+        categories: of each category, after V views.
+        loss: as in training, after every view.
+        examples: the first shapes with what was predicted of them.
+    """
+
+    measure: str
+    by_view: dict[int, float]
+    categories: dict[str, float]
+    loss: float
+    examples: list[Example]
+
+    @property
+    def value(self) -> float:
+        """The measure after the last view."""
+        return self.by_view[max(self.by_view)]
+
+    def is_better_than(self, value: float | None) -> bool:
+        """Whether the measure is better than a value; any is better than none."""
+        if value is None:
+            return True
+        return self.value > value if self.measure == "iou" else self.value < value
+
+    def fields(self) -> dict[str, Any]:
+        """What the log holds of it."""
+        return {self.measure: self.by_view, "per_category": self.categories, "loss": self.loss}
+
+
+@torch.no_grad()
+def evaluate_model(
+    model: nn.Module, batches: Iterator[Batch], stop: StopRequest, *, region: str, pictures: int
+) -> Evaluation | None:
+    """Measure a model on batches, which together with those of the other processes are the whole set.
+
+    Args:
+        model: its mode is restored in the end.
+        batches: every shape with V views.
+        stop: when it is asked for, in whichever process, nothing is measured.
+        region: of the loss of depth.
+        pictures: how many shapes to keep with what is predicted of them.
+
+    Returns:
+        What was found, in all processes the same but for the examples; None where a stop was asked for.
+    """
+    measures: dict[int, Any] = {}
+    total = count = 0.0
+    examples: list[Example] = []
+    kind = "iou"
+    was_training = model.training
+    model.eval()
+    try:
+        for batch in batches:
+            if stop:
+                break
+            output = model(batch.images, batch.cameras, batch.view_mask)
+            terms, number = sum_loss(output, batch, region=region)
+            total, count = total + float(terms), count + float(number)
+            names = [name or "all" for name in batch.category]
+            if hasattr(output, "logits"):
+                predicted = output.logits.float().sigmoid()
+                for view in range(predicted.shape[1]):
+                    measure = measures.setdefault(view + 1, VoxelIoU())
+                    measure.update(predicted[:, view], batch.occupancy, names)
+            else:
+                kind, predicted = "depth_error", output.depth.float()
+                for view in range(predicted.shape[1]):
+                    measure = measures.setdefault(view + 1, DepthError())
+                    measure.update(predicted[:, view], batch.depth, names, batch.mask)
+            for index in range(min(pictures - len(examples), len(predicted))):
+                examples.append(Example(_sample(batch, index), predicted[index].cpu()))
+    finally:
+        model.train(was_training)
+    if any_true(bool(stop)):
+        return None
+    parts = gather((measures, total, count, kind))
+    together, *others = [part[0] for part in parts if part[0]]  # a process may have had no shape
+    for other in others:
+        for view, measure in other.items():
+            together[view].merge(measure)
+    means = {view: measure.compute() for view, measure in sorted(together.items())}
+    return Evaluation(
+        measure=next(part[3] for part in parts if part[0]),
+        by_view={view: found.mean for view, found in means.items()},
+        categories=means[max(means)].categories,
+        loss=sum(part[1] for part in parts) / max(1.0, sum(part[2] for part in parts)),
+        examples=examples,
+    )
+
+
+def _sample(batch: Batch, index: int) -> Sample:
+    """One shape of a batch, on the CPU."""
+    return Sample(
+        batch.images[index].cpu(),
+        CameraTensors(*(torch.as_tensor(value)[index].cpu() for value in batch.cameras)),
+        None if batch.depth is None else batch.depth[index].cpu(),
+        None if batch.mask is None else batch.mask[index].cpu(),
+        None if batch.occupancy is None else batch.occupancy[index].cpu(),
+        batch.mesh[index],
+        batch.category[index],
+        batch.name[index],
+    )

@@ -1,0 +1,206 @@
+"""What a run tells while it goes: lines of JSON, TensorBoard, pictures, and a bar or a line now and then."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import sys
+import time
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lsmgeo.data.files import write_atomic
+from lsmgeo.errors import DataError
+from lsmgeo.models.training.evaluating import Evaluation
+from lsmgeo.models.training.pictures import draw_examples
+
+__all__ = ["RunLog"]
+
+LOG = "log.jsonl"
+SECONDS_BETWEEN_LINES = 30.0
+
+
+class RunLog:
+    """The log of a run, written by its first process; the others hold one that does nothing.
+
+    A full disk does not end the run: the first line that cannot be written warns, and later ones are tried again.
+
+    Args:
+        folder: the run's folder.
+        step: where the run begins or goes on; what TensorBoard shows from later steps is replaced.
+        steps: where it ends, if that is known.
+        is_writer: whether this process writes.
+        tensorboard: whether to write for TensorBoard.
+        quiet: whether to show no progress.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        step: int,
+        steps: int | None,
+        is_writer: bool = True,
+        tensorboard: bool = True,
+        quiet: bool = False,
+    ) -> None:
+        self.folder, self.is_writer = folder, is_writer
+        self._warned: set[str] = set()
+        self._shown = time.monotonic()
+        self._board = self._open_board(step) if is_writer and tensorboard else None
+        self._bar: Any = None
+        self._prints = is_writer and not quiet
+        if self._prints and sys.stderr.isatty():
+            from tqdm import tqdm
+
+            self._bar = tqdm(total=steps, initial=step, unit="step", dynamic_ncols=True, smoothing=0.05)
+
+    def __enter__(self) -> RunLog:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.close()
+        if self._board is not None:
+            with contextlib.suppress(OSError):
+                self._board.close()
+
+    def event(self, name: str, **values: Any) -> None:
+        """Append a line.
+
+        Args:
+            name: what happened.
+            values: what JSON holds; numbers that are not finite become text.
+        """
+        if not self.is_writer:
+            return
+        line = json.dumps({"event": name, **_plain(values), "time": round(time.time(), 3)}, allow_nan=False)
+        try:
+            descriptor = os.open(self.folder / LOG, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+            try:
+                os.write(descriptor, line.encode() + b"\n")
+            finally:
+                os.close(descriptor)
+        except OSError as error:
+            self._warn(LOG, f"{self.folder / LOG}: cannot be written ({error}); the run goes on")
+
+    def step(self, step: int, *, waited: float, **values: float) -> None:
+        """A step's line, and its curves.
+
+        Args:
+            step: how many steps have been taken.
+            waited: seconds for which the step waited for data.
+            values: loss, gradient_norm, learning_rate, epoch, seconds of training so far.
+        """
+        self.event("step", step=step, **values, waited=_short(waited))
+        self.scalars(step, {f"train/{name}": value for name, value in values.items()})
+
+    def evaluation(self, step: int, found: Evaluation, *, seconds: float, best: int | None) -> None:
+        """What an evaluation found: a line, curves and pictures.
+
+        Args:
+            step: how many steps had been taken.
+            found: by the evaluation.
+            seconds: that it took.
+            best: the step of the best so far.
+        """
+        self.event("evaluation", step=step, **found.fields(), evaluation_seconds=_short(seconds), best=best)
+        by_view = {f"{found.measure}/{view}_views": value for view, value in found.by_view.items()}
+        by_category = {f"{found.measure}_by_category/{name}": value for name, value in found.categories.items()}
+        self.scalars(step, {"loss/held_back": found.loss, **by_view, **by_category})
+        views = ", ".join(f"{value:.4f}" for value in found.by_view.values())
+        self.say(f"step {step}: {found.measure.replace('_', ' ')} after 1 to {len(found.by_view)} views: {views}")
+        if found.examples and self.is_writer:
+            self.picture(step, "predicted", draw_examples(found.examples))
+
+    def scalars(self, step: int, values: Mapping[str, float]) -> None:
+        """Curves for TensorBoard."""
+        if self._board is not None:
+            with self._forgiven():
+                for name, value in values.items():
+                    self._board.add_scalar(name, value, step)
+
+    def picture(self, step: int, name: str, picture: npt.NDArray[np.uint8]) -> None:
+        """A picture (h, w, 3): for TensorBoard, and as ``pictures/NAME_STEP.png``."""
+        if not self.is_writer:
+            return
+        import io
+
+        from PIL import Image
+
+        content = io.BytesIO()
+        Image.fromarray(picture).save(content, "PNG")
+        try:
+            write_atomic(self.folder / "pictures" / f"{name}_{step:08d}.png", content.getvalue())
+        except DataError as error:
+            self._warn("pictures", f"{error}; the run goes on")
+        if self._board is not None:
+            with self._forgiven():
+                self._board.add_image(name, picture, step, dataformats="HWC")
+
+    def progress(self, step: int, text: str) -> None:
+        """Show where the run is: at every call on a terminal, elsewhere a line every half minute."""
+        if self._bar is not None:
+            self._bar.update(step - self._bar.n)
+            self._bar.set_postfix_str(text, refresh=False)
+        elif self._prints and time.monotonic() - self._shown >= SECONDS_BETWEEN_LINES:
+            self._shown = time.monotonic()
+            print(f"step {step}: {text}", file=sys.stderr, flush=True)
+
+    def say(self, text: str) -> None:
+        """Print a line."""
+        if self._bar is not None:
+            self._bar.write(text, file=sys.stderr)
+        elif self._prints:
+            print(text, file=sys.stderr, flush=True)
+
+    def _open_board(self, step: int) -> Any:
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+
+            return SummaryWriter(str(self.folder / "tensorboard"), purge_step=step or None)
+        except ImportError:
+            warnings.warn("tensorboard is not installed: log.jsonl and pictures alone are written", stacklevel=3)
+        except OSError as error:
+            self._warn("tensorboard", f"TensorBoard's files cannot be written ({error}); the run goes on")
+        return None
+
+    @contextlib.contextmanager
+    def _forgiven(self) -> Any:
+        try:
+            yield
+        # Its writer is a thread, whose errors come with a later call.
+        except (OSError, RuntimeError) as error:
+            self._board = None
+            self._warn("tensorboard", f"TensorBoard's files cannot be written ({error}); the run goes on without")
+
+    def _warn(self, what: str, message: str) -> None:
+        if what not in self._warned:
+            self._warned.add(what)
+            warnings.warn(message, stacklevel=3)
+
+
+def _short(value: float) -> float:
+    """Six digits of a time."""
+    return float(f"{value:.6g}")
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON holds it."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    return value if isinstance(value, str | int | bool | None) else str(value)

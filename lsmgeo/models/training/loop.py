@@ -1,0 +1,334 @@
+"""The training loop, from top to bottom."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lsmgeo.data import Batch, write_atomic
+from lsmgeo.errors import CheckpointError, TrainingError
+from lsmgeo.models.creating import settings_of
+from lsmgeo.models.run_folders import CHECKPOINTS, step_folder
+from lsmgeo.models.training.checkpoints import check_config, load_latest, save_checkpoint
+from lsmgeo.models.training.config import TrainingConfig
+from lsmgeo.models.training.evaluating import Evaluation, evaluate_model
+from lsmgeo.models.training.feeding import Need, open_shapes, training_batches, validation_batches
+from lsmgeo.models.training.guard import StepGuard, are_finite
+from lsmgeo.models.training.logs import RunLog
+from lsmgeo.models.training.optimising import (
+    find_gradients,
+    learning_rate,
+    loss_steps,
+    make_optimiser,
+    move_parameters,
+)
+from lsmgeo.models.training.processes import any_true, check_agreement, gather
+from lsmgeo.models.training.randomness import random_state, restore_random_state
+from lsmgeo.models.training.signals import StopRequest, catch_stop
+from lsmgeo.models.training.starting import make_model, parameter_checksum, started
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
+
+__all__ = ["Trained", "train"]
+
+CONFIG = "config.json"
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A run that has ended.
+
+    Attributes:
+        folder: the run's.
+        step: how many steps it has taken.
+        checkpoint: of this step.
+        best: the step of the best evaluation, None where there was none.
+        evaluation: the last one; None where none was made since the run began or was resumed.
+        ended: "steps", "minutes" or "stop", which is after a signal.
+        is_first: whether this is the first process of the run.
+        exit_code: what the process should end with: 0, or 128 plus the signal's number.
+    """
+
+    folder: Path
+    step: int
+    checkpoint: Path
+    best: int | None
+    evaluation: Evaluation | None
+    ended: str
+    is_first: bool = True
+    exit_code: int = 0
+
+
+@dataclass
+class Place:
+    """Where a run is, the same in all processes."""
+
+    step: int = 0  # batches that were taken, also those whose gradient was not finite
+    moved: int = 0  # steps that moved the parameters
+    seconds: float = 0.0
+    evaluated: int = 0  # the step of the last evaluation
+    best: int | None = None
+    best_value: float | None = None
+
+
+def train(config: TrainingConfig, out: str | os.PathLike[str], *, quiet: bool = False) -> Trained:
+    """Train a model, or go on where a run stopped.
+
+    The folder holds afterwards ``config.json``, ``log.jsonl``, ``tensorboard``, ``pictures`` and ``checkpoints``. A run
+    that is resumed, after a signal or after a kill, ends with the same weights, bit by bit on a CPU, as one that never
+    stopped. With `torchrun`, every process calls this; gradients are as if one process had taken all shapes.
+
+    Args:
+        config: of the run.
+        out: the run's folder; where it holds checkpoints, the run is resumed.
+        quiet: whether to show no progress.
+
+    Returns:
+        `Trained`.
+
+    Raises:
+        OptionError, DataError: settings or data that cannot be used.
+        CheckpointError: the folder is another run's, or its checkpoints cannot be used, or the last one not be written.
+        TrainingError: losses or gradients were not finite, again and again; or processes do not start from the same.
+    """
+    with (
+        started(config.run, has_idle_parameters=config.model.variant == "release") as accelerator,
+        catch_stop() as stop,
+    ):
+        return _train(config, Path(out), accelerator, stop, quiet=quiet)
+
+
+def _train(
+    config: TrainingConfig, folder: Path, accelerator: Accelerator, stop: StopRequest, *, quiet: bool
+) -> Trained:
+    run, data = config.run, config.data
+    device, rank, processes = accelerator.device, accelerator.process_index, accelerator.num_processes
+
+    model = make_model(config.model, run, device)
+    need = Need(model.image_size, model.resolution if model.output == "voxels" else None, model.output == "depth")
+    most = data.view_range[1]
+    shapes = open_shapes(data, need, seed=run.seed, device=device, is_training=True)
+    held_back = open_shapes(
+        data, need, seed=run.seed, device=device, is_training=False, views=run.evaluate_views or most
+    )
+    optimiser = make_optimiser(model, config.optimiser)
+    guard = StepGuard(in_a_row=run.max_bad_steps, share=run.max_bad_fraction)
+    place = Place()
+
+    identity = {**config.to_dict(), "processes": processes, "shapes": shapes.identity}
+    checkpoint = load_latest(folder)
+    if checkpoint is not None:
+        check_config(checkpoint, identity, free=config.free())
+        checkpoint.restore_model(model)
+        checkpoint.restore("optimiser", optimiser)
+        checkpoint.restore("guard", guard)
+        if accelerator.scaler is not None:
+            checkpoint.restore("scaler", accelerator.scaler)
+        restore_random_state(checkpoint.part("random"))
+        place = Place(**checkpoint.part("place"))
+    check_agreement(
+        {"the configuration": identity, "the step": place.step, "the parameters": parameter_checksum(model)}
+    )
+
+    wrapped = accelerator.prepare_model(model)
+    taken_a_step = run.batch * run.accumulation * processes
+    batches = training_batches(
+        shapes,
+        seed=run.seed,
+        start=place.step * taken_a_step,
+        batch=run.batch,
+        workers=data.workers,
+        device=device,
+        rank=rank,
+        processes=processes,
+    )
+    terms = run.batch * (need.voxels**3 if need.voxels else most * need.image_size**2)
+    saved = None if checkpoint is None else checkpoint.path
+    saved_step = None if checkpoint is None else checkpoint.step
+    evaluation: Evaluation | None = None
+    ended = ""
+    begin = time.monotonic() - place.seconds
+    # Told before the work, not after.
+    if rank == 0:
+        write_atomic(folder / CONFIG, json.dumps(config.to_dict(), indent=1).encode())
+    log = RunLog(
+        folder, step=place.step, steps=run.steps, is_writer=rank == 0, tensorboard=run.tensorboard, quiet=quiet
+    )
+
+    def save(*, must: bool) -> None:
+        nonlocal saved, saved_step
+        place.seconds = time.monotonic() - begin
+        epoch, position = divmod(place.step * taken_a_step, len(shapes))
+        state = {
+            "optimiser": optimiser.state_dict(),
+            "guard": guard.state_dict(),
+            "scaler": None if accelerator.scaler is None else accelerator.scaler.state_dict(),
+            "random": random_state(),
+            "sampler": {"epoch": epoch, "position": position, "seed": run.seed},
+            "place": asdict(place),
+        }
+        reason = None
+        if rank == 0:
+            try:
+                path = save_checkpoint(
+                    folder / CHECKPOINTS,
+                    place.step,
+                    model=model,
+                    state=state,
+                    config=identity,
+                    keep=run.keep,
+                    best=place.best,
+                )
+                log.event("checkpoint", step=place.step, path=path.name)
+            except CheckpointError as error:
+                reason = str(error)
+                log.event("checkpoint_failed", step=place.step, reason=reason)
+        # The others wait here until it stands, and hear whether it does.
+        reason = gather(reason)[0]
+        if reason is None:
+            saved, saved_step = folder / CHECKPOINTS / step_folder(place.step), place.step
+        elif must:
+            raise CheckpointError(folder / CHECKPOINTS, reason)
+        else:
+            warnings.warn(f"{reason}; the run goes on without this checkpoint", stacklevel=3)
+
+    # Closed whatever happens: the readers are deaf to the signals with which Python ends its children.
+    with log, contextlib.closing(batches):
+        log.event(
+            "start" if checkpoint is None else "resume",
+            step=place.step,
+            model=settings_of(model),
+            parameters=sum(parameter.numel() for parameter in model.parameters()),
+            shapes=len(shapes),
+            held_back=min(run.evaluate_shapes, len(held_back)),
+            processes=processes,
+            device=str(device),
+        )
+        log.say(
+            f"{model.name}, {sum(parameter.numel() for parameter in model.parameters()):,} parameters, on {device}"
+            f"{f', {processes} processes' if processes > 1 else ''}: {len(shapes)} shapes, {taken_a_step} a step; "
+            f"evaluated on {min(run.evaluate_shapes, len(held_back))}"
+            f"{'' if checkpoint is None else f'; goes on at step {place.step} of {checkpoint.path}'}"
+        )
+        while True:
+            if not ended and run.steps is not None and place.step >= run.steps:
+                ended = "steps"
+
+            if place.step > place.evaluated and ended != "stop" and (ended or place.step % run.evaluate_every == 0):
+                begun = time.monotonic()
+                with contextlib.closing(
+                    validation_batches(
+                        held_back,
+                        seed=run.seed,
+                        count=run.evaluate_shapes,
+                        batch=run.batch,
+                        device=device,
+                        workers=min(1, data.workers),
+                        rank=rank,
+                        processes=processes,
+                    )
+                ) as held_back_batches:
+                    found = evaluate_model(
+                        model,
+                        held_back_batches,
+                        stop,
+                        region=run.region,
+                        pictures=run.pictures if rank == 0 else 0,
+                    )
+                if found is None:
+                    ended = "stop"
+                else:
+                    evaluation, place.evaluated = found, place.step
+                    if found.is_better_than(place.best_value):
+                        place.best, place.best_value = place.step, found.value
+                    log.evaluation(place.step, found, seconds=time.monotonic() - begun, best=place.best)
+
+            is_due = ended or place.step % run.checkpoint_every == 0 or place.step == place.best
+            if is_due and place.step != saved_step:
+                # The first tells before the work whether the folder can be written.
+                save(must=bool(ended) or place.step == 0)
+            if ended:
+                break
+
+            begun = time.monotonic()
+            taken = fetch(batches, run.accumulation, stop)
+            waited = time.monotonic() - begun
+            if any_true(taken is None or bool(stop)):
+                ended = "stop"
+                continue
+            if run.minutes is not None and any_true(begun - begin > 60 * run.minutes):
+                ended = "minutes"
+                continue
+            assert taken is not None
+
+            found_gradients = find_gradients(
+                wrapped,
+                taken,
+                optimiser,
+                accelerator,
+                steps=loss_steps(run, place.step, most),
+                region=run.region,
+                terms=terms,
+            )
+            place.step += 1
+            rate = learning_rate(config.optimiser, place.moved, run.steps)
+            if found_gradients.is_finite:
+                guard.admits(place.step, is_bad=False)
+                move_parameters(optimiser, accelerator, found_gradients, rate=rate, clip=config.optimiser.clip_norm)
+                place.moved += 1
+            else:
+                names = [name for part in gather([name for batch in taken for name in batch.name]) for name in part]
+                log.event(
+                    "skipped",
+                    step=place.step,
+                    loss=found_gradients.loss,
+                    gradient_norm=found_gradients.norm,
+                    shapes=names,
+                )
+                log.say(f"step {place.step}: the loss or the gradient is not finite; skipped")
+                is_scaled = accelerator.scaler is not None and are_finite(found_gradients.loss)
+                scale = accelerator.scaler.get_scale() if is_scaled else None
+                try:
+                    guard.admits(place.step, is_bad=True, names=names, scale=scale)
+                except TrainingError:
+                    save(must=False)
+                    log.event("stop", step=place.step, reason="not finite")
+                    raise
+            if accelerator.scaler is not None:
+                accelerator.scaler.update()
+            optimiser.zero_grad()
+
+            seconds = time.monotonic() - begun
+            if place.step % run.log_every == 0:
+                log.step(
+                    place.step,
+                    epoch=place.step * taken_a_step / len(shapes),
+                    loss=found_gradients.loss,
+                    gradient_norm=found_gradients.norm,
+                    learning_rate=rate,
+                    seconds=seconds,
+                    waited=waited,
+                )
+            log.progress(place.step, f"loss {found_gradients.loss:.4f}, {seconds:.2f} s a step")
+        log.event("stop", step=place.step, reason=ended, seconds=round(place.seconds, 1))
+    assert saved is not None
+    return Trained(folder, place.step, saved, place.best, evaluation, ended, rank == 0, stop.exit_code)
+
+
+def fetch(batches: Iterator[Batch], count: int, stop: StopRequest) -> list[Batch] | None:
+    """The batches of a step; None as soon as a stop is asked for."""
+    taken: list[Batch] = []
+    while len(taken) < count:
+        batch = stop.next_item(batches)
+        if batch is None:
+            return None
+        taken.append(batch)
+    return taken

@@ -1,0 +1,158 @@
+"""One step of training: gradients of the mean loss over all shapes of all processes, and Adam."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import distributed, nn
+
+from lsmgeo.data import Batch
+from lsmgeo.models.losses import sum_loss
+from lsmgeo.models.training.config import OptimiserConfig, RunConfig
+from lsmgeo.models.training.guard import are_finite
+from lsmgeo.models.training.randomness import seeded_generator
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
+
+__all__ = ["Gradients", "find_gradients", "learning_rate", "loss_steps", "make_optimiser", "move_parameters"]
+
+Steps = str | Sequence[int] | None
+
+
+class Gradients(NamedTuple):
+    """What `find_gradients` leaves in the parameters' ``grad``, and of what.
+
+    Attributes:
+        loss: the mean over all shapes of all processes.
+        norm: of the gradient of this mean.
+        factor: what ``grad`` is still to be multiplied by to be this gradient.
+    """
+
+    loss: float
+    norm: float
+    factor: float
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether the parameters may follow it; the same in all processes, as loss and norm are."""
+        return are_finite(self.loss, self.norm)
+
+
+def make_optimiser(model: nn.Module, config: OptimiserConfig) -> torch.optim.Optimizer:
+    """Adam, or AdamW where weights decay."""
+    kind = torch.optim.AdamW if config.weight_decay else torch.optim.Adam
+    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    return kind(parameters, lr=config.learning_rate, betas=config.betas, weight_decay=config.weight_decay, fused=True)
+
+
+def find_gradients(
+    wrapped: nn.Module,
+    batches: Sequence[Batch],
+    optimiser: torch.optim.Optimizer,
+    accelerator: Accelerator,
+    *,
+    steps: Steps,
+    region: str,
+    terms: float,
+) -> Gradients:
+    """The loss of some batches in every process, and its gradient in the parameters' ``grad``.
+
+    Processes and batches may hold differently many terms of the loss, since shapes have differently many views. So sums
+    are differentiated, and divided by the number of all terms in the end: shapes weigh the same wherever they are.
+
+    Args:
+        wrapped: the model, as the accelerator prepared it; its gradients are None.
+        batches: of this process, one after the other.
+        optimiser: of its parameters.
+        accelerator: of the run.
+        steps: after which views the loss is taken, see `loss_steps`.
+        region: of the loss of depth.
+        terms: about how many terms a batch has: sums are divided by it, so that gradients are of an ordinary size.
+    """
+    sums = torch.zeros(2, device=accelerator.device)
+    for index, batch in enumerate(batches):
+        is_last = index == len(batches) - 1
+        with contextlib.nullcontext() if is_last else accelerator.no_sync(wrapped):
+            asked = [min(steps[0], batch.view_mask.shape[1] - 1)] if isinstance(steps, list) else steps
+            output = wrapped(batch.images, batch.cameras, batch.view_mask, steps=asked)
+            part, number = sum_loss(output, batch, region=region, steps=asked)
+            accelerator.backward(part / terms)
+        sums += torch.stack((part.detach(), number))
+    if accelerator.num_processes > 1:
+        distributed.all_reduce(sums)
+    if accelerator.scaler is not None:
+        accelerator.scaler.unscale_(optimiser)
+    of_all, number = sums.tolist()
+    # The processes' gradients were averaged, and are to be added.
+    factor = terms * accelerator.num_processes / max(number, 1.0)
+    gradients = [parameter.grad for parameter in wrapped.parameters() if parameter.grad is not None]
+    return Gradients(of_all / max(number, 1.0), factor * float(torch.nn.utils.get_total_norm(gradients)), factor)
+
+
+def move_parameters(
+    optimiser: torch.optim.Optimizer, accelerator: Accelerator, found: Gradients, *, rate: float, clip: float | None
+) -> None:
+    """Take a step.
+
+    Args:
+        optimiser: its parameters hold what `find_gradients` found.
+        accelerator: of the run; its scaler, if there is one, is updated by the caller.
+        found: their loss and norm, finite.
+        rate: the learning rate.
+        clip: the largest norm; None for no such limit.
+    """
+    factor = found.factor * (1.0 if clip is None or found.norm <= clip else clip / found.norm)
+    groups = optimiser.param_groups
+    gradients = [parameter.grad for group in groups for parameter in group["params"] if parameter.grad is not None]
+    torch._foreach_mul_(gradients, factor)
+    for group in groups:
+        group["lr"] = rate
+    if accelerator.scaler is None:
+        optimiser.step()
+    else:
+        accelerator.scaler.step(optimiser)
+
+
+def learning_rate(config: OptimiserConfig, taken: int, steps: int | None) -> float:
+    """The learning rate of a step.
+
+    Equation: with t = steps taken before, w = warm_up and n = steps: ``min(1, (t + 1) / w)`` times the configured rate,
+    and with a cosine times ``(1 + cos(pi t / n)) / 2``.
+
+    Args:
+        config: of the optimiser.
+        taken: how many steps moved the parameters before; skipped ones do not count.
+        steps: where the run ends.
+
+    Example:
+        >>> config = OptimiserConfig(learning_rate=1.0, schedule="cosine", warm_up=4)
+        >>> [learning_rate(config, taken, 100) for taken in (0, 50)]
+        [0.25, 0.5]
+    """
+    rate = config.learning_rate
+    if config.warm_up:
+        rate *= min(1.0, (taken + 1) / config.warm_up)
+    if config.schedule == "cosine" and steps is not None:
+        rate *= 0.5 * (1 + math.cos(math.pi * min(1.0, taken / steps)))
+    return rate
+
+
+def loss_steps(run: RunConfig, step: int, views: int) -> Steps:
+    """After which views the loss of a step is taken, as the models take it: the same in all processes.
+
+    Args:
+        run: of the run.
+        step: which.
+        views: the most that a shape has.
+    """
+    if run.loss_views == "every":
+        return None
+    if run.loss_views == "last":
+        return "last"
+    drawn = torch.randint(views, (1,), generator=seeded_generator(run.seed, step, 0x76696577))
+    return [int(drawn)]

@@ -1,0 +1,93 @@
+"""What stands before the first step: processes and their devices, and the model."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import torch
+from torch import nn
+
+from lsmgeo.errors import OptionError
+from lsmgeo.models.creating import create, settings_of
+from lsmgeo.models.model import Model
+from lsmgeo.models.training.config import ModelConfig, RunConfig
+from lsmgeo.models.weights import load
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
+
+__all__ = ["make_model", "parameter_checksum", "started"]
+
+
+@contextlib.contextmanager
+def started(run: RunConfig, *, has_idle_parameters: bool) -> Iterator[Accelerator]:
+    """The processes of a run, as `torchrun` started them, or this one alone.
+
+    Args:
+        run: says device and precision.
+        has_idle_parameters: whether some parameters never get a gradient.
+
+    Raises:
+        OptionError: accelerate is not installed, or the device cannot compute in this precision.
+    """
+    try:
+        from accelerate import Accelerator
+        from accelerate.state import AcceleratorState
+        from accelerate.utils import DistributedDataParallelKwargs
+    except ImportError as error:
+        raise OptionError("train: accelerate is needed; pip install 'lsmgeo[train]'") from error
+
+    is_cpu = run.device == "cpu" or not torch.cuda.is_available()
+    if run.precision == "fp16" and is_cpu:
+        raise OptionError("run: precision must be 'no' or 'bf16' on a CPU; got 'fp16'")
+    options = DistributedDataParallelKwargs(
+        broadcast_buffers=False, gradient_as_bucket_view=True, find_unused_parameters=has_idle_parameters
+    )
+    was_distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
+    AcceleratorState._reset_state(reset_partial_state=True)  # of another run in this process
+    try:
+        yield Accelerator(cpu=is_cpu, mixed_precision=run.precision, kwargs_handlers=[options])
+    finally:
+        if not was_distributed and torch.distributed.is_available() and torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+        AcceleratorState._reset_state(reset_partial_state=True)
+
+
+def make_model(config: ModelConfig, run: RunConfig, device: torch.device) -> Model:
+    """The model that is trained, with weights from the seed or from a file.
+
+    Raises:
+        OptionError: there is no such model, or the file holds another.
+        CheckpointError: the file cannot be used.
+    """
+    torch.manual_seed(run.seed)
+    model = create(config.name, preset=config.preset, variant=config.variant, **config.settings)
+    if config.weights is not None:
+        other = load(config.weights)
+        mine, theirs = settings_of(model), settings_of(other)
+        for key in mine:
+            if theirs.get(key) != mine[key]:
+                raise OptionError(
+                    f"model: weights are of another model: {key} is {theirs.get(key)!r} in {config.weights}, "
+                    f"{mine[key]!r} here"
+                )
+        model.load_state_dict(other.state_dict())
+    model.to(device)
+    if run.channels_last:
+        formats = {4: torch.channels_last, 5: torch.channels_last_3d}
+        for parameter in model.parameters():
+            if parameter.dim() in formats:
+                parameter.data = parameter.data.contiguous(memory_format=formats[parameter.dim()])
+    return model.train()
+
+
+def parameter_checksum(model: nn.Module) -> str:
+    """A hash of all parameters and buffers."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(model.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()[:16]

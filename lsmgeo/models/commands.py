@@ -25,7 +25,7 @@ def evaluate(
     orders: int = 8,
     planes: int = 300,
     split: Literal["test", "val", "train"] = "test",
-    device: str = "auto",
+    device: Literal["auto", "cpu", "cuda"] = "auto",
 ) -> int:
     """Make a table or figure of the paper from trained models: printed, and written as JSON, CSV and pictures.
 
@@ -92,7 +92,7 @@ def evaluate(
     found = evaluation.open_shapes(
         shards,
         size=max(contender.size for contender in contenders),
-        shapes=shapes or DRAWN.get(report),
+        shapes=DRAWN.get(report) if shapes is None else shapes,
         seed=seed,
         split=split,
     )
@@ -111,11 +111,11 @@ def evaluate(
     return 0
 
 
-def train(config: str, out: str = "lsmgeo-run", set: list[str] | None = None, quiet: bool = False) -> int:
+def train(configuration: str, out: str = "lsmgeo-run", set: list[str] | None = None, quiet: bool = False) -> int:
     """Train a model, or go on where a run stopped; on several devices with torchrun, see the guide.
 
     Args:
-        config: a TOML or JSON file; examples/configs holds some.
+        configuration: a TOML or JSON file; examples/configs holds some.
         out: the run's folder, for checkpoints, the log and pictures; where it holds a run already, that goes on.
         set: a setting that comes before the file's, such as --set run.steps=100; may be given again and again.
         quiet: whether to show no progress.
@@ -127,7 +127,7 @@ def train(config: str, out: str = "lsmgeo-run", set: list[str] | None = None, qu
 
     from lsmgeo.models import training
 
-    trained = training.train(training.read_config(config, set or ()), out, quiet=quiet)
+    trained = training.train(training.read_config(configuration, set or ()), out, quiet=quiet)
     if trained.is_first:
         why = {"steps": "all its steps are taken", "minutes": "its time is over", "stop": "it was asked to"}
         print(f"ended:       at step {trained.step}, since {why[trained.ended]}")

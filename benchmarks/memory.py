@@ -93,11 +93,40 @@ def _measure(problem: Problem, name: str, kind: str, threads: int) -> dict[str, 
     return {**kept, "inputs": sum(leaf.nbytes for leaf in inputs), "peak": measured, "above": measured - needed}
 
 
-def _answer(connection: Any, *arguments: Any) -> None:
+def _measured(*arguments: Any) -> dict[str, Any]:
     try:
-        connection.send(_measure(*arguments))
+        return _measure(*arguments)
     except MemoryError:
-        connection.send({"left_out": "no memory"})
+        return {"left_out": "no memory"}
+
+
+def _answer(connection: Any, function: Callable[..., Any], *arguments: Any) -> None:
+    connection.send(function(*arguments))
+
+
+def alone(function: Callable[..., Any], *arguments: Any, limit: float = 300.0) -> Any:
+    """What a function of a module answers in a process of its own.
+
+    Raises:
+        TimeoutError: not within `limit` seconds.
+        EOFError: it ended without an answer.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["benchmarks.memory"])
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_answer, args=(sender, function, *arguments), daemon=True)
+    process.start()
+    sender.close()
+    try:
+        if not receiver.poll(limit):
+            raise TimeoutError(f"took more than {limit:.0f} s")
+        return receiver.recv()
+    finally:
+        process.join(10)
+        if process.is_alive():
+            process.terminate()
+            process.join()
+        receiver.close()
 
 
 def measure(problem: Problem, name: str, kind: str, threads: int = 2, limit: float = 300.0) -> dict[str, Any]:
@@ -110,22 +139,12 @@ def measure(problem: Problem, name: str, kind: str, threads: int = 2, limit: flo
         return _measure(problem, name, kind, threads)
     if not can_measure():
         return {"left_out": "this system tells no peak"}
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["benchmarks.memory"])
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_answer, args=(sender, problem, name, kind, threads), daemon=True)
-    process.start()
-    sender.close()
     try:
-        return receiver.recv() if receiver.poll(limit) else {"left_out": f"took more than {limit:.0f} s"}
+        return alone(_measured, problem, name, kind, threads, limit=limit)
+    except TimeoutError as error:
+        return {"left_out": str(error)}
     except EOFError:
         return {"left_out": "ended early, most likely out of memory"}
-    finally:
-        process.join(10)
-        if process.is_alive():
-            process.terminate()
-            process.join()
-        receiver.close()
 
 
 def known(count: int) -> int:

@@ -156,3 +156,24 @@ def reached_rows(cases: Sequence[Mapping[str, Any]]) -> Rows:
         for row in case["rows"]:
             rows.append([row["section"], row["what"], row["measured"], row["goal"] or "—", said[row["reached"]]])
     return rows
+
+
+def model_rows(cases: Sequence[Mapping[str, Any]]) -> Rows:
+    """A step of a model with the library's operators and with hand-written ones: times, peaks, and their ratios."""
+    timed = [case for case in cases if "times" in case]
+    names = list(dict.fromkeys(name for case in timed for name in case["times"]))
+    rows = [["step", *(f"{n}, ms" for n in names), "of times", *(f"{n}, peak MB" for n in names), "of peaks"]]
+    for case in timed:
+        times = [case["times"][name]["median_ms"] for name in names]
+        peaks = [case["peak"][name] for name in names]
+        known = all(peaks)
+        rows.append(
+            [
+                case["case"],
+                *(milliseconds(case["times"][name]) for name in names),
+                f"{times[0] / times[1]:.2f}",
+                *(f"{peak / 1e6:.0f}" if known else "—" for peak in peaks),
+                f"{peaks[0] / peaks[1]:.2f}" if known else "—",
+            ]
+        )
+    return rows

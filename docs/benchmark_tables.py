@@ -26,10 +26,11 @@ TABLES: dict[str, Callable[[list[dict[str, Any]]], report.Rows]] = {
     "memory": lambda cases: report.memory_rows([case for case in cases if "memory" in case]),
     "compiling": report.first_call_rows,
     "left-out": report.left_out_rows,
-    "rates": report.rate_rows,
+    "rates": lambda cases: report.rate_rows([case for case in cases if "rate" in case]),
     "figures": report.figure_rows,
     "mistakes": report.mistake_rows,
     "reached": report.reached_rows,
+    "models": report.model_rows,
 }
 # Figures of the plot directive, and the results that they draw.
 PLOTS = {"benchmark_growth": "growth", "classical_density": "classical"}

@@ -8,7 +8,7 @@ import json
 import pytest
 import torch
 
-from benchmarks import compiled, contenders, gate, kernel, known_sets, loading, memory, report, scenes, timing
+from benchmarks import compiled, contenders, gate, kernel, known_sets, loading, memory, models, report, scenes, timing
 from benchmarks.measure import timings
 from benchmarks.problems import LeftOut, Problem, Scene
 from benchmarks.settings import TINY, Settings
@@ -171,3 +171,25 @@ def test_the_benchmarks_of_training_data_run(capsys):
     printed = capsys.readouterr().out
     assert "lsmgeo render, 4 shapes of 2 views" in printed
     assert "4 of 4 views, 64 x 64, no depth" in printed
+
+
+@pytest.mark.parametrize("name", models.MODELS)
+def test_models_on_hand_written_operators_are_the_same_models(name):
+    work = models.Work(name, Settings(quick=True), scenes=2, views=2)
+    work.check()
+    for kind in models.KINDS:
+        for contender in work.models:
+            work.step(contender, kind)()
+    work.models[contenders.HAND].unproject.centers += 0.02
+    with pytest.raises(gate.Different):
+        work.check()
+
+
+def test_steps_of_models_make_a_table():
+    times = {name: {"median_ms": ms, "quartiles_ms": [ms, ms]} for name, ms in (("a", 50.0), ("b", 100.0))}
+    cases = [{"case": "step", "times": times, "peak": {"a": 3e7, "b": 6e7}}, {"case": "rate", "rate": 2.0}]
+    cases.append({"case": "untold", "times": times, "peak": {"a": None, "b": None}})
+    assert report.model_rows(cases)[1:] == [
+        ["step", "50.0 ± 0.0", "100 ± 0", "0.50", "30", "60", "0.50"],
+        ["untold", "50.0 ± 0.0", "100 ± 0", "0.50", "—", "—", "—"],
+    ]

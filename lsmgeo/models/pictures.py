@@ -24,6 +24,8 @@ AMBIENT = 0.35
 FINER = 2
 # Half the side of what is seen of the unit cube's world.
 REACH = 0.56
+# Dots at once, which bounds the memory of a picture.
+MOST_DOTS = 1 << 24
 ANGLES = ("azimuth", "elevation")
 # Between neighbouring pixels whose points are farther apart than this many of their widths there is no surface.
 STEEPEST = 10.0
@@ -100,6 +102,8 @@ def _visible_faces(grid: np.ndarray, view: Floats) -> tuple[Floats, npt.NDArray[
     crowded = uniform_filter(padded.astype(np.float64), 5)
     quads, shades = [], []
     for axis in range(3):
+        if abs(view[2, axis]) < 1e-9:
+            continue  # on edge
         side = -1 if view[2, axis] > 0 else 1
         others = [other for other in range(3) if other != axis]
         voxel = np.argwhere(grid & ~np.roll(padded, -side, axis)[3:-3, 3:-3, 3:-3])
@@ -206,8 +210,9 @@ def _splat(quads: Floats, colours: Floats, view: Floats, size: int, reach: float
 def _dots(quads: Floats, scale: float) -> Floats:
     """Dots (Q, N, 3) of quads, so dense that nothing shows between them at so many pixels a unit."""
     widest = float(np.linalg.norm(quads - np.roll(quads, 1, 1), axis=-1).max())
-    number = int(np.clip(np.ceil(1.5 * scale * widest), 2, 24))
-    s, t = (axis.reshape(-1) for axis in np.meshgrid(*[np.linspace(0, 1, number)] * 2))
+    number = int(np.clip(np.ceil(1.5 * scale * widest), 2, np.sqrt(MOST_DOTS / len(quads)) + 2))
+    middles = (np.arange(number) + 0.5) / number
+    s, t = (axis.reshape(-1) for axis in np.meshgrid(middles, middles))
     return np.asarray(np.stack(((1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t), 1) @ quads)
 
 

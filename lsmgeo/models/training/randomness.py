@@ -38,9 +38,9 @@ def random_state() -> dict[str, Any]:
     return {
         "torch": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-        "python": [version, list(words), gauss],
+        "python": [version, torch.tensor(words), gauss],
         "numpy": {
-            "key": [int(word) for word in legacy["state"]["key"]],
+            "key": torch.from_numpy(legacy["state"]["key"].astype(np.int64)),
             "pos": int(legacy["state"]["pos"]),
             "has_gauss": int(legacy["has_gauss"]),
             "gauss": float(legacy["gauss"]),
@@ -59,7 +59,7 @@ def restore_random_state(state: dict[str, Any]) -> None:
         for device, words in enumerate(state["cuda"][: torch.cuda.device_count()]):
             torch.cuda.set_rng_state(words, device)
     version, words, gauss = state["python"]
-    random.setstate((version, tuple(words), gauss))
+    random.setstate((version, tuple(words.tolist()), gauss))
     numpy = state["numpy"]
-    legacy = ("MT19937", np.array(numpy["key"], np.uint32), numpy["pos"], numpy["has_gauss"], numpy["gauss"])
+    legacy = ("MT19937", numpy["key"].numpy().astype(np.uint32), numpy["pos"], numpy["has_gauss"], numpy["gauss"])
     np.random.set_state(legacy)  # noqa: NPY002 - as above

@@ -1,0 +1,80 @@
+"""Small training runs: shards of random blobs, the smallest network, and what a run has left behind."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lsmgeo.cameras import orbit
+from lsmgeo.data import Sample, encode_sample, hash_settings, write_shard
+from lsmgeo.models.training import DataConfig, ModelConfig, OptimiserConfig, RunConfig, Trained, TrainingConfig, train
+from lsmgeo.models.training.checkpoints import load_checkpoint
+
+SIZES = {"encoder_channels": (4, 4), "grid_channels": (4,), "feature_channels": 4, "hidden_channels": 4}
+TRAINING, HELD_BACK = 6, 2
+
+
+def write_shapes(folder: Path) -> Path:
+    """Shards of shapes to train on and others to evaluate on, 3 views of 32 pixels each."""
+    generator = torch.Generator().manual_seed(0)
+    items = []
+    for number in range(TRAINING + HELD_BACK):
+        cameras = orbit(
+            40.0 * number + torch.tensor([0.0, 100.0, 230.0]), 20.0, 2.0, focal_length=50.0, height=32, width=32
+        )
+        images = torch.rand(3, 3, 32, 32, generator=generator)
+        occupancy = torch.rand(16, 16, 16, generator=generator) < 0.3
+        sample = Sample(images, cameras, None, None, occupancy, None, "chair", f"chair-{number}")
+        items.append((number, encode_sample(sample, number, split="train" if number < TRAINING else "val")))
+    write_shard(folder / "set-000000.tar", items, hash_settings({"made": "by a test"}))
+    return folder
+
+
+def configure(shards: Path, *, workers: int = 0, clip_norm: float | None = None, **run: object) -> TrainingConfig:
+    """A run of 2 shapes a step, so 3 steps an epoch, that says and keeps everything."""
+    settings = {
+        "steps": 6, "batch": 2, "device": "cpu", "tensorboard": False, "pictures": 0, "evaluate_every": 1000,
+        "evaluate_shapes": 2, "checkpoint_every": 2, "log_every": 1, "keep": 2, "seed": 3, **run,
+    }  # fmt: skip
+    return TrainingConfig(
+        model=ModelConfig(name="voxel-lsm", preset="tiny", settings=SIZES),
+        data=DataConfig(source=str(shards), views=(1, 2), workers=workers),
+        optimiser=OptimiserConfig(learning_rate=0.01, warm_up=3, clip_norm=clip_norm),
+        run=RunConfig(**settings),
+    )
+
+
+def run(config: TrainingConfig, folder: Path) -> Trained:
+    return train(config, folder, quiet=True)
+
+
+def events(folder: Path, name: str | None = None) -> list[dict]:
+    """The lines of a run's log."""
+    lines = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    return [line for line in lines if name in (None, line["event"])]
+
+
+def losses(folder: Path) -> dict[int, float | str]:
+    """The loss of every step that was taken; of a step that was taken twice both must agree."""
+    found: dict[int, float | str] = {}
+    for line in events(folder, "step"):
+        assert found.setdefault(line["step"], line["loss"]) == line["loss"], f"step {line['step']} differs"
+    return found
+
+
+def end_of(folder: Path) -> tuple[int, dict[str, Tensor], dict]:
+    """Step, weights and optimiser's state at the end of a run."""
+    checkpoint = load_checkpoint(folder)
+    return checkpoint.step, dict(checkpoint.weights.tensors), checkpoint.part("optimiser")
+
+
+def assert_same_end(folder: Path, expected: Path) -> None:
+    """Two runs ended at one step with equal numbers, bit by bit, and every loss on the way was the same."""
+    (step, weights, moments), (step_there, weights_there, moments_there) = end_of(folder), end_of(expected)
+    assert step == step_there
+    torch.testing.assert_close(weights, weights_there, rtol=0, atol=0)
+    torch.testing.assert_close(moments, moments_there, rtol=0, atol=0)
+    assert losses(folder).items() <= losses(expected).items()

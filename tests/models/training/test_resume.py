@@ -1,0 +1,187 @@
+"""A run that stopped and went on is the run that never stopped, bit by bit (F9, F10, F11)."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+
+from lsmgeo.errors import CheckpointError
+from lsmgeo.models import create
+from lsmgeo.models.training import TrainingConfig, loop
+from lsmgeo.models.training.checkpoints import load_checkpoint
+from tests.models.training.runs import SIZES, assert_same_end, configure, events, losses, run, write_shapes
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory) -> Path:
+    return write_shapes(tmp_path_factory.mktemp("shards"))
+
+
+@pytest.fixture(scope="module")
+def whole(shards, tmp_path_factory) -> Path:
+    """A run of two epochs that nothing happens to."""
+    folder = tmp_path_factory.mktemp("whole")
+    assert run(configure(shards), folder).ended == "steps"
+    return folder
+
+
+@pytest.fixture(scope="module")
+def half(shards, tmp_path_factory) -> Path:
+    """The first 2 steps of it."""
+    folder = tmp_path_factory.mktemp("half")
+    run(configure(shards, steps=2), folder)
+    return folder
+
+
+@pytest.fixture
+def begun(half, tmp_path) -> Path:
+    return shutil.copytree(half, tmp_path / "run")
+
+
+def stop_in(monkeypatch, step: int) -> None:
+    """Ask to stop in the middle of a step, the first of the process being 1."""
+    find, calls = loop.find_gradients, []
+
+    def find_gradients(*arguments, **options):
+        calls.append(1)
+        if len(calls) == step:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return find(*arguments, **options)
+
+    monkeypatch.setattr(loop, "find_gradients", find_gradients)
+
+
+@pytest.mark.parametrize("step", [1, 3, 4])
+def test_a_run_stopped_at_a_step_goes_on_as_if_it_had_not(shards, whole, tmp_path, monkeypatch, step):
+    with monkeypatch.context() as patch:
+        stop_in(patch, step)
+        stopped = run(configure(shards), tmp_path)
+    assert (stopped.step, stopped.ended, stopped.exit_code) == (step, "stop", 143)
+    assert stopped.checkpoint.name == f"step_{step:08d}"
+    assert run(configure(shards), tmp_path).ended == "steps"
+    assert_same_end(tmp_path, whole)
+    assert losses(tmp_path) == losses(whole)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_a_run_stopped_at_every_step_goes_on_as_if_it_had_not(shards, tmp_path, monkeypatch):
+    """40 steps; each of 40 runs stops once, at another step, and one more run stops at all of them."""
+    config = configure(shards, steps=40, checkpoint_every=1000)
+    expected = tmp_path / "whole"
+    run(config, expected)
+    for step in range(1, 40):
+        folder = tmp_path / str(step)
+        with monkeypatch.context() as patch:
+            stop_in(patch, step)
+            assert run(config, folder).step == step
+        run(config, folder)
+        assert_same_end(folder, expected)
+        assert losses(folder) == losses(expected)
+    folder = tmp_path / "all"
+    for step in range(1, 40):
+        with monkeypatch.context() as patch:
+            stop_in(patch, 1)
+            assert run(config, folder).step == step
+    run(config, folder)
+    assert_same_end(folder, expected)
+    assert losses(folder) == losses(expected)
+
+
+def test_the_comparison_can_fail(shards, whole, tmp_path):
+    """Another seed, a step more or less, a learning rate that is off by a hair."""
+    run(configure(shards, seed=4), tmp_path / "seed")
+    run(configure(shards, steps=5), tmp_path / "steps")
+    config = configure(shards)
+    rate = dataclasses.replace(config.optimiser, learning_rate=config.optimiser.learning_rate * (1 + 1e-6))
+    run(dataclasses.replace(config, optimiser=rate), tmp_path / "rate")
+    for name in ("seed", "steps", "rate"):
+        with pytest.raises(AssertionError):
+            assert_same_end(tmp_path / name, whole)
+
+
+def test_the_same_seed_gives_the_same_run(shards, whole, tmp_path):
+    run(configure(shards), tmp_path)
+    assert_same_end(tmp_path, whole)
+    assert losses(tmp_path) == losses(whole)
+
+
+@pytest.mark.parametrize("workers", [1, pytest.param(4, marks=pytest.mark.long)])
+def test_the_number_of_workers_changes_nothing(shards, whole, tmp_path, workers):
+    run(configure(shards, workers=workers), tmp_path)
+    assert_same_end(tmp_path, whole)
+    assert losses(tmp_path) == losses(whole)
+
+
+def test_a_run_goes_on_with_other_workers_and_later_checkpoints(shards, whole, begun):
+    run(configure(shards, workers=2, checkpoint_every=3, keep=1), begun)
+    assert_same_end(begun, whole)
+    assert sorted(os.listdir(begun / "checkpoints"))[0] == "LATEST"
+
+
+def test_a_finished_run_stays_as_it_is(shards, whole, tmp_path):
+    folder = shutil.copytree(whole, tmp_path / "run")
+    again = run(configure(shards), folder)
+    assert (again.step, again.ended) == (6, "steps")
+    assert_same_end(folder, whole)
+    assert len(events(folder, "checkpoint")) == len(events(whole, "checkpoint"))
+
+
+def test_a_damaged_checkpoint_costs_steps_and_nothing_else(shards, whole, tmp_path):
+    folder = shutil.copytree(whole, tmp_path / "run")
+    (folder / "checkpoints" / "step_00000006" / "state.pt").write_bytes(b"")
+    with pytest.warns(UserWarning, match=r"step_00000006.* Going back to .*step_00000004"):
+        run(configure(shards), folder)
+    assert_same_end(folder, whole)
+    assert [line["step"] for line in events(folder, "resume")] == [4]
+
+
+def changed(config: TrainingConfig, group: str, **values: object) -> TrainingConfig:
+    return dataclasses.replace(config, **{group: dataclasses.replace(getattr(config, group), **values)})
+
+
+@pytest.mark.parametrize(
+    ("group", "values", "named"),
+    [
+        ("run", {"batch": 3}, r"run\.batch was 2 and is 3 now"),
+        ("run", {"seed": 5}, r"run\.seed was 3 and is 5 now"),
+        (
+            "model",
+            {"settings": {**SIZES, "hidden_channels": 8}},
+            r"model\.settings\.hidden_channels was 4 and is 8 now",
+        ),
+        ("model", {"name": "r2n2", "settings": {}}, r"model\.name was 'voxel-lsm' and is 'r2n2' now"),
+        ("optimiser", {"learning_rate": 0.1}, r"optimiser\.learning_rate was 0\.01 and is 0\.1 now"),
+        ("data", {"views": 2}, r"data\.views was \[1, 2\] and is 2 now"),
+    ],
+)
+def test_another_run_is_refused_by_the_name_of_what_differs(shards, begun, group, values, named):
+    before = sorted(os.listdir(begun / "checkpoints"))
+    with pytest.raises(CheckpointError, match=named):
+        run(changed(configure(shards), group, **values), begun)
+    assert sorted(os.listdir(begun / "checkpoints")) == before
+
+
+def test_weights_of_another_shape_and_states_without_a_part_are_refused(shards, begun, monkeypatch):
+    checkpoint = load_checkpoint(begun)
+    state = {name: value for name, value in checkpoint.state.items() if name != "guard"}
+    other = dataclasses.replace(checkpoint, state=state)
+    monkeypatch.setattr(loop, "load_latest", lambda folder: other)
+    with pytest.raises(CheckpointError, match=r"state\.pt has no 'guard'"):
+        run(configure(shards), begun)
+    weights = dataclasses.replace(checkpoint.weights, tensors=create("voxel-lsm", preset="tiny").state_dict())
+    other = dataclasses.replace(checkpoint, weights=weights)
+    with pytest.raises(CheckpointError, match="float32; the model has"):
+        run(configure(shards), begun)
+
+
+def test_evaluations_and_checkpoints_change_nothing(shards, whole, tmp_path):
+    run(configure(shards, evaluate_every=1, checkpoint_every=1), tmp_path)
+    assert_same_end(tmp_path, whole)
+    assert losses(tmp_path) == losses(whole)
+    assert len(events(tmp_path, "evaluation")) == 6

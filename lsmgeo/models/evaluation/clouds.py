@@ -98,7 +98,7 @@ def report_clouds(contenders: Sequence[Contender], shapes: Shapes, options: Opti
 def _depths(contenders: Sequence[Contender], batch: Batch, count: int, options: Options) -> dict[str, Tensor]:
     """Depth (count, H, W) of every method from the first views of one shape."""
     images, cameras = batch.images[:, :count], first_views(batch.cameras, count)
-    swept = sweep_views(images[0], select(cameras, 0, 0), planes=options.planes, window=options.window)
+    swept = sweep_views(images[0], select(cameras, 0, 0), planes=options.planes, window=options.window).depth
     return {SWEEP: swept} | {one.name: one.depths(images, cameras)[0] for one in contenders}
 
 

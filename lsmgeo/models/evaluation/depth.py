@@ -14,17 +14,15 @@ from lsmgeo.models.evaluation.contenders import Contender, pick
 from lsmgeo.models.evaluation.facts import facts_of
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.paper import DEPTH, paper_categories
-from lsmgeo.models.evaluation.plane_sweeps import SWEEP, sweep_views
-from lsmgeo.models.evaluation.report import Report, Row, Table
+from lsmgeo.models.evaluation.plane_sweeps import SURE, SWEEP, Swept, sweep_views
+from lsmgeo.models.evaluation.report import Cell, Report, Row, Table
 from lsmgeo.models.evaluation.scores import Scores, joined
 from lsmgeo.models.evaluation.shapes import Shapes, SizedShapes, batches
 
 __all__ = ["report_depth"]
 
 VIEWS = 10
-MEASURES = (
-    "median error", "mean error", "median error, all pixels", "mean error, all pixels", "share of pixels with depth"
-)  # fmt: skip
+MEASURES = ("median", "mean", "median, sure", "median, all", "mean, all", "has depth [%]", "is sure [%]")
 
 
 def report_depth(contenders: Sequence[Contender], shapes: Shapes, options: Options) -> Report:
@@ -40,8 +38,9 @@ def report_depth(contenders: Sequence[Contender], shapes: Shapes, options: Optio
         options: views (10), planes, window, batch.
 
     Returns:
-        Table "categories" in world units; "measures" with mean errors besides, and errors over all of the object's
-        pixels, which plane sweep leaves out.
+        Table "categories" in world units; "measures" with mean errors besides, the median over the pixels where plane
+        sweep is sure (a confidence of 0.05 and more, with which it would be used), and errors over all of the object's
+        pixels.
 
     Raises:
         OptionError: a model that gives no depth, models of different sizes, or one view alone.
@@ -57,28 +56,27 @@ def report_depth(contenders: Sequence[Contender], shapes: Shapes, options: Optio
     for batch in batches(sized, views, options.batch, resolution=None, depth=True, progress=options.progress):
         assert batch.depth is not None
         assert batch.mask is not None
-        swept = torch.stack(
-            [
-                sweep_views(images, select(batch.cameras, 0, place), planes=options.planes, window=options.window)
-                for place, images in enumerate(batch.images)
-            ]
-        )
-        found = {SWEEP: swept} | {one.name: one.depths(batch.images, batch.cameras) for one in contenders}
+        sweeps = [
+            sweep_views(images, select(batch.cameras, 0, place), planes=options.planes, window=options.window)
+            for place, images in enumerate(batch.images)
+        ]
+        swept = Swept(*(torch.stack(maps) for maps in zip(*sweeps, strict=True)))
+        found = {SWEEP: swept.depth} | {one.name: one.depths(batch.images, batch.cameras) for one in contenders}
         for name, depth in found.items():
-            scores[name].add(batch.name, batch.category, _errors(depth, batch.depth, batch.mask, swept > 0))
+            scores[name].add(batch.name, batch.category, _errors(depth, batch.depth, batch.mask, swept))
     categories = sorted(set(shapes.categories))
     rows = [Row(name, one.category_cells(0, categories)) for name, one in scores.items()]
     known = [name for name in DEPTH if name == SWEEP or name in {one.title for one in contenders}]
     rows += [paper_categories(name, DEPTH[name], categories) for name in known]
-    measures = [Row(name, one.cells()) for name, one in scores.items()]
+    measures = [Row(name, [*(cells := one.cells())[:5], *map(_percent, cells[5:])]) for name, one in scores.items()]
     return Report(
         "depth",
         [
             Table("categories", "median depth error", [*categories, "mean"], rows, 3),
-            Table("measures", "errors [world units]", MEASURES, measures, 4),
+            Table("measures", "depth errors [world units]", MEASURES, measures, 4),
         ],
         facts_of(contenders, shapes, options, views=views, planes=options.planes, window=options.window, size=size),
-        joined(scores, "median error, mean error, both of all pixels, share with depth"),
+        joined(scores, ", ".join(MEASURES).replace(" [%]", "")),
         notes=notes,
     )
 
@@ -95,14 +93,22 @@ def one_size(contenders: Sequence[Contender]) -> int:
     return next(iter(found.values()))
 
 
-def _errors(predicted: Tensor, depth: Tensor, mask: Tensor, has_sweep: Tensor) -> Tensor:
-    """The measures (B, 5) of depth maps (B, V, H, W): means over the views that have a pixel that counts."""
+def _errors(predicted: Tensor, depth: Tensor, mask: Tensor, swept: Swept) -> Tensor:
+    """The measures (B, 7) of depth maps (B, V, H, W): means over the views that have a pixel that counts."""
     on = mask & (depth > 0)
+    has_sweep, sure = on & (swept.depth > 0), on & (swept.confidence >= SURE)
+    pixels = on.sum((-2, -1))
     columns = [
-        median_depth_error(predicted, depth, on & has_sweep).error,
-        depth_errors(predicted, depth, on & has_sweep).l1,
+        median_depth_error(predicted, depth, has_sweep).error,
+        depth_errors(predicted, depth, has_sweep).l1,
+        median_depth_error(predicted, depth, sure).error,
         median_depth_error(predicted, depth, on).error,
         depth_errors(predicted, depth, on).l1,
         depth_errors(predicted, depth, on).density,
+        sure.sum((-2, -1)) / pixels,
     ]
-    return torch.stack([column.nanmean(1) for column in columns], 1)
+    return torch.stack([column.double().nanmean(1) for column in columns], 1)
+
+
+def _percent(cell: Cell) -> Cell:
+    return Cell(100 * cell.value, 100 * cell.error)

@@ -18,7 +18,7 @@ from lsmgeo.models.evaluation.sequences import report_sequences
 from lsmgeo.models.evaluation.shapes import Shapes
 from lsmgeo.models.evaluation.unseen import report_unseen
 
-__all__ = ["DRAWN", "REPORTS", "evaluate"]
+__all__ = ["FEW", "REPORTS", "evaluate"]
 
 REPORTS: Mapping[str, Callable[[Sequence[Contender], Shapes, Options], Report]] = {
     "iou": report_iou,
@@ -32,8 +32,8 @@ REPORTS: Mapping[str, Callable[[Sequence[Contender], Shapes, Options], Report]] 
 }
 """What makes each table or figure."""
 
-DRAWN = {"sequences": 13, "clouds": 3}
-"""Reports that draw every shape, and how many shapes they take unless told."""
+FEW = {"sequences": 13, "clouds": 3, "depth": 26}
+"""Reports that draw every shape, or take long, and how many shapes they take unless told."""
 
 
 def evaluate(
@@ -52,6 +52,14 @@ def evaluate(
 
     Raises:
         OptionError: an unknown report, or models that it is not about.
+
+    Example:
+        >>> from lsmgeo.models import create
+        >>> from lsmgeo.models.evaluation import Contender, Options, evaluate, open_shapes
+        >>> untrained = Contender("V-LSM", create("voxel-lsm", preset="tiny"))
+        >>> report = evaluate([untrained], open_shapes(None, size=32, shapes=1), "iou", Options(views=1))
+        >>> [row.name for row in report.tables[0].rows]
+        ['V-LSM', 'visual hull', 'visual hull, strict', 'paper, V-LSM', 'paper, visual hull']
     """
     make = REPORTS[check_choice("evaluate", "report", report, tuple(REPORTS))]
     return make(contenders, shapes, options or Options())

@@ -12,7 +12,7 @@ import torch
 
 from lsmgeo.errors import OptionError
 from lsmgeo.models.evaluation import Contender, Options, Training, evaluate, write_report
-from lsmgeo.models.evaluation.plane_sweeps import sweep_views
+from lsmgeo.models.evaluation.plane_sweeps import Swept, sweep_views
 from tests.models.evaluation.fakes import SIZE, FakeDepths, FakeShapes, FakeVoxels, iou
 
 # Three chairs and one lamp: a mean over shapes is not the mean of the categories.
@@ -169,7 +169,9 @@ def test_depth_counts_the_pixels_that_plane_sweep_has(monkeypatch):
     half = SIZE // 2
     swept = torch.full((3, SIZE, SIZE), 2.05)
     swept[:, :, half:] = 0.0
-    monkeypatch.setattr("lsmgeo.models.evaluation.depth.sweep_views", lambda images, cameras, **options: swept)
+    sure = torch.zeros(3, SIZE, SIZE)
+    sure[:, 4:6, :2] = 0.5
+    monkeypatch.setattr("lsmgeo.models.evaluation.depth.sweep_views", lambda *given, **options: Swept(swept, sure))
     off = torch.full((SIZE, SIZE), 0.03)
     off[0] = -0.03
     off[:, half:] = 0.5  # where plane sweep has nothing
@@ -180,10 +182,11 @@ def test_depth_counts_the_pixels_that_plane_sweep_has(monkeypatch):
     np.testing.assert_allclose(values(report, "categories", "fake"), [0.03] * 3, rtol=1e-5)
     np.testing.assert_allclose(values(report, "categories", "plane sweep"), [0.05] * 3, rtol=1e-5)
     left, all_pixels = (np.abs(maps.numpy()).ravel()[1:] for maps in (off[:, :half], off))
-    expected = [np.median(left), left.mean(), np.median(all_pixels), all_pixels.mean(), 1.0]
+    pixels = SIZE * SIZE - 1
+    expected = [np.median(left), left.mean(), 0.04, np.median(all_pixels), all_pixels.mean(), 100.0, 400 / pixels]
     np.testing.assert_allclose(values(report, "measures", "fake"), expected, rtol=1e-5)
-    share = (half * SIZE - 1) / (SIZE * SIZE - 1)
-    np.testing.assert_allclose(values(report, "measures", "plane sweep"), [0.05] * 4 + [share], rtol=1e-5)
+    share = 100 * (half * SIZE - 1) / pixels
+    np.testing.assert_allclose(values(report, "measures", "plane sweep"), [0.05] * 5 + [share, 400 / pixels], rtol=1e-5)
     assert values(report, "categories", "paper, D-LSM") == [0.023, 0.027, 0.024]
 
 
@@ -196,7 +199,7 @@ def test_plane_sweep_finds_a_plane():
     reach = (0.2 - origins[:, None, None, 0]) / directions[..., 0]  # the wall is at x = 0.2
     place = origins[:, None, None] + reach[..., None] * directions
     grey = 0.5 + 0.25 * torch.sin(40 * place[..., 1]) + 0.25 * torch.sin(33 * place[..., 2] + 1)
-    depth = sweep_views(grey[:, None].expand(-1, 3, -1, -1), cameras, planes=100, window=5)
+    depth = sweep_views(grey[:, None].expand(-1, 3, -1, -1), cameras, planes=100, window=5).depth
     inner = depth[0, 6:-6, 6:-6]
     torch.testing.assert_close(inner, torch.full_like(inner, 1.8), atol=0.02, rtol=0)
 

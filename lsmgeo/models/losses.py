@@ -69,16 +69,19 @@ def sum_loss(
     # After the last of the views there is always something to tell, also where its own place is padding.
     is_told = batch.view_mask.any(1, keepdim=True) if steps == "last" else batch.view_mask[:, after]
     weight = is_told.float()[:, :, None, None, None]
-    if isinstance(output, VoxelOutput):
-        target = truth[:, None].float().expand(predicted.shape)
-        terms = binary_cross_entropy_with_logits(predicted.float(), target, reduction="none")
-    else:
+    if isinstance(output, DepthOutput):
         is_object = truth > 0 if batch.mask is None else (truth > 0) & batch.mask
         counted = is_object if region == "object" else torch.ones_like(is_object)
         weight = weight * (counted & batch.view_mask[:, :, None, None])[:, None]
-        terms = (predicted.float() - torch.where(is_object, truth, FAR)[:, None]).abs()
-    # The choice, not the product alone: nothing that does not count may reach the sum as infinity times 0.
-    terms = torch.where(weight > 0, terms, 0.0)
+    # Left out before and after, by choice and not by product: 0 times a NaN or an infinity reaches sums and gradients.
+    counts = weight > 0
+    predicted = torch.where(counts, predicted.float(), 0.0)
+    if isinstance(output, VoxelOutput):
+        target = truth[:, None].float().expand(predicted.shape)
+        terms = binary_cross_entropy_with_logits(predicted, target, reduction="none")
+    else:
+        terms = (predicted - torch.where(is_object, truth, FAR)[:, None]).abs()
+    terms = torch.where(counts, terms, 0.0)
     return terms.sum(), weight.expand(terms.shape).sum()
 
 

@@ -39,7 +39,17 @@ MAY_IMPORT = {
 }
 OUTSIDE_THE_CORE = {"models", "data", "classical", "scenes", "metrics", "cli", "demo", "diagnosis"}
 # What the parts outside may import of each other; the core is open to all of them.
-MAY_ALSO_IMPORT = {"scenes": set(), "data": {"scenes"}, "metrics": set(), "diagnosis": {"data"}}
+MAY_ALSO_IMPORT = {
+    "scenes": set(),
+    "data": {"scenes"},
+    "metrics": set(),
+    "diagnosis": {"data"},
+    "models": {"data", "scenes", "metrics", "classical"},
+}
+NETWORKS = {
+    "blocks", "creating", "depth_lsm", "grid_unet", "image_encoder", "losses", "machine", "model", "outputs", "presets",
+    "r2n2", "settings", "voxel_lsm",
+}  # fmt: skip
 HEAVY = {"cv2", "trimesh", "skimage", "matplotlib", "jsonargparse", "triton", "scipy", "tqdm", "PIL"}
 
 
@@ -94,10 +104,26 @@ def test_data_and_scenes_stand_below_models(module):
     assert own & OUTSIDE_THE_CORE <= MAY_ALSO_IMPORT[part(module)] | {part(module)}
 
 
-@pytest.mark.parametrize("package", ["lsmgeo.scenes", "lsmgeo.scenes.synthetic13", "lsmgeo.data", "lsmgeo.metrics"])
+def test_the_models_stand_above_all_but_the_command_line():
+    for module, path in MODULES.items():
+        if part(module) not in ("models", "cli"):
+            assert not any(name.startswith("lsmgeo.models") for name in imported(path, module)), module
+
+
+def test_the_networks_know_nothing_of_training():
+    """Who has the networks alone needs neither accelerate nor the trainer."""
+    above = ("accelerate", "tensorboard", "lsmgeo.models.training", "lsmgeo.models.evaluation")
+    for module in (f"lsmgeo.models.{name}" for name in NETWORKS):
+        assert not any(name.startswith(above) for name in imported(MODULES[module], module)), module
+
+
+@pytest.mark.parametrize(
+    "package", ["lsmgeo.scenes", "lsmgeo.scenes.synthetic13", "lsmgeo.data", "lsmgeo.metrics", "lsmgeo.models"]
+)
 def test_scenes_and_data_import_lightly(package):
     new = {name.split(".")[0] for name in loaded_by(f"import {package}") - loaded_by("import torch, kornia.geometry")}
-    assert new & (HEAVY | {"embreex", "manifold3d", "joblib", "distributed", "webdataset"}) == set()
+    later = {"embreex", "manifold3d", "joblib", "distributed", "webdataset", "accelerate", "tensorboard"}
+    assert new & (HEAVY | later) == set()
 
 
 @pytest.mark.parametrize("module", MODULES)

@@ -33,9 +33,7 @@ class Convolution(nn.Module):
         bias: whether to add a learned bias.
 
     Example:
-        >>> from collections.abc import Callable
-
-    import torch
+        >>> import torch
         >>> from lsmgeo.models.blocks import Convolution
         >>> down, up = Convolution(2, 3, 4, 5, stride=2), Convolution(2, 4, 3, 3, stride=2, transposed=True)
         >>> tuple(down(torch.rand(1, 3, 12, 16)).shape), tuple(up(down(torch.rand(1, 3, 12, 16))).shape)
@@ -94,9 +92,7 @@ class InstanceNorm(nn.Module):
         eps: added to the variance.
 
     Example:
-        >>> from collections.abc import Callable
-
-    import torch
+        >>> import torch
         >>> from lsmgeo.models.blocks import InstanceNorm
         >>> InstanceNorm(1)(torch.tensor([0.0, 2.0, 4.0, 6.0]).reshape(1, 1, 2, 2)).flatten()
         tensor([-1.3416, -0.4472, 0.4472, 1.3416], grad_fn=<ViewBackward0>)
@@ -128,9 +124,7 @@ class Block(nn.Module):
         transposed: see `Convolution`.
 
     Example:
-        >>> from collections.abc import Callable
-
-    import torch
+        >>> import torch
         >>> from lsmgeo.models.blocks import Block
         >>> tuple(Block(3, 2, 5, 4, norm="scale", stride=2)(torch.rand(1, 2, 8, 8, 8)).shape)
         (1, 5, 4, 4, 4)

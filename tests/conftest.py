@@ -24,12 +24,16 @@ torch.set_num_threads(1)
 if os.environ.get("LSMGEO_TEST_WITHOUT_TRITON") == "1":
     sys.modules["triton"] = None  # type: ignore[assignment]
 
-# What the core's lines are counted in: the operators' own tests. Counting doubles the time of all that is Python.
-COUNTED = ("lsmgeo", "tests/kernels", "tests/property", "tests/structure")
+# What the core's lines are counted in: its own tests. Counting doubles the time of all that is Python.
+COUNTED = ("lsmgeo", "tests/fuzz", "tests/interop", "tests/kernels", "tests/models/test_fusion_recurrent.py",
+           "tests/property", "tests/structure")  # fmt: skip
+# Compilers and children that are killed: slow to count, and they count nothing.
+NOT_COUNTED = ("tests/fuzz/test_junk.py", "tests/interop/test_compile.py")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    counted = [config.rootpath / folder for folder in COUNTED]
+    counted, not_counted = ([config.rootpath / name for name in names] for names in (COUNTED, NOT_COUNTED))
     for item in items:
-        if not any(Path(item.path).is_relative_to(folder) for folder in counted):
+        path = Path(item.path)
+        if path in not_counted or not any(path.is_relative_to(folder) for folder in counted):
             item.add_marker("no_cover")

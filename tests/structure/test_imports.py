@@ -117,11 +117,12 @@ def test_the_networks_know_nothing_of_training():
         assert not any(name.startswith(above) for name in imported(MODULES[module], module)), module
 
 
-@pytest.mark.parametrize(
-    "package", ["lsmgeo.scenes", "lsmgeo.scenes.synthetic13", "lsmgeo.data", "lsmgeo.metrics", "lsmgeo.models"]
-)
-def test_scenes_and_data_import_lightly(package):
-    new = {name.split(".")[0] for name in loaded_by(f"import {package}") - loaded_by("import torch, kornia.geometry")}
+PACKAGES = ("lsmgeo", "lsmgeo.scenes", "lsmgeo.scenes.synthetic13", "lsmgeo.data", "lsmgeo.metrics", "lsmgeo.models")
+
+
+@pytest.mark.parametrize("package", PACKAGES[1:])
+def test_scenes_and_data_import_lightly(package, brought):
+    new = {name.split(".")[0] for name in brought[package]}
     later = {"embreex", "manifold3d", "joblib", "distributed", "webdataset", "accelerate", "tensorboard"}
     assert new & (HEAVY | later) == set()
 
@@ -188,18 +189,34 @@ def test_geometry_is_elementwise(module):
         assert not (isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.MatMult)), node.lineno
 
 
-def loaded_by(code: str) -> set[str]:
-    """Names of the modules that a fresh interpreter has loaded after the code."""
-    command = [sys.executable, "-c", f"{code}\nimport sys\nprint(*sorted(sys.modules))"]
-    return set(subprocess.run(command, capture_output=True, text=True, check=True, cwd=PACKAGE.parent).stdout.split())
+# One new interpreter imports torch and kornia, which takes seconds, and is forked for each package.
+IMPORTS = """
+import os, sys, warnings, torch, kornia.geometry
+warnings.simplefilter("ignore", DeprecationWarning)  # of forking beside threads
+theirs = set(sys.modules)
+for package in sys.argv[1:]:
+    sys.stdout.flush()
+    child = os.fork()
+    if child == 0:
+        __import__(package)
+        print(package, *sorted(set(sys.modules) - theirs), flush=True)
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0, package
+"""
 
 
-def test_the_import_is_light():
-    theirs = loaded_by("import torch, kornia.geometry")
-    ours = loaded_by("import lsmgeo")
+@pytest.fixture(scope="module")
+def brought() -> dict[str, set[str]]:
+    """Names of the modules that importing each package brings, beyond those of torch and kornia."""
+    command = [sys.executable, "-c", IMPORTS, *PACKAGES]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
+    return {package: set(names) for package, *names in map(str.split, done.stdout.splitlines())}
+
+
+def test_the_import_is_light(brought):
+    ours = brought["lsmgeo"]
     assert "lsmgeo.kernels.reference" in ours
-    new = {name.split(".")[0] for name in ours - theirs}
-    assert new & HEAVY == set()
+    assert {name.split(".")[0] for name in ours} & HEAVY == set()
     assert {part(name) for name in ours if name.startswith("lsmgeo.")} <= set(MAY_IMPORT)
 
 

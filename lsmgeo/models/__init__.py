@@ -6,7 +6,7 @@ from lsmgeo.models.losses import compute_loss, sum_loss
 from lsmgeo.models.model import Model
 from lsmgeo.models.outputs import DepthOutput, DepthResult, VoxelOutput, VoxelResult
 from lsmgeo.models.r2n2 import R2N2, R2N2Settings
-from lsmgeo.models.settings import DepthSettings, VoxelSettings
+from lsmgeo.models.settings import DepthSettings, MachineSettings, VoxelSettings
 from lsmgeo.models.voxel_lsm import VoxelLSM
 from lsmgeo.models.weights import load, write_weights
 
@@ -16,6 +16,7 @@ __all__ = [
     "DepthOutput",
     "DepthResult",
     "DepthSettings",
+    "MachineSettings",
     "Model",
     "R2N2Settings",
     "VoxelLSM",

@@ -80,7 +80,7 @@ class MachineSettings:
 
 @dataclass(frozen=True)
 class VoxelSettings(MachineSettings):
-    """What a `VoxelLSM` is built from.
+    """What a `VoxelLSM` is built from: `MachineSettings`, and its own.
 
     Attributes:
         upsample: voxels of the occupancy along a side of one of the grid's: a cheap way to a finer output.
@@ -98,7 +98,7 @@ class VoxelSettings(MachineSettings):
 
 @dataclass(frozen=True)
 class DepthSettings(MachineSettings):
-    """What a `DepthLSM` is built from.
+    """What a `DepthLSM` is built from: `MachineSettings`, and its own.
 
     Attributes:
         near: depth of the first plane that is swept, world units.

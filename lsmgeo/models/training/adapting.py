@@ -43,7 +43,7 @@ def turn_cameras(cameras: CameraTensors, degrees: float, seed: int, epoch: int, 
 
 
 def resize_sample(sample: Sample, size: int) -> Sample:
-    """A sample with square images of another size, each new pixel the mean of the area that it covers.
+    """A sample with square images of another size: smaller ones hold means of areas, larger ones are interpolated.
 
     Depth is the mean over the object's part of the area, and the object is what covers half of it or more.
 
@@ -70,8 +70,9 @@ def resize_sample(sample: Sample, size: int) -> Sample:
         share = _averaged(mask.float(), size)
         if depth is not None:
             depth = torch.where(share >= 0.5, _averaged(depth * mask, size) / share.clamp_min(1e-6), 0.0)
+    mode = "area" if size < sample.images.shape[-1] else "bilinear"
     return sample._replace(
-        images=torch.nn.functional.interpolate(sample.images, (size, size), mode="area"),
+        images=torch.nn.functional.interpolate(sample.images, (size, size), mode=mode),
         cameras=camera_tools.resize(sample.cameras, size, size),
         depth=depth,
         mask=None if sample.mask is None or share is None else share >= 0.5,

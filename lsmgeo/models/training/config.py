@@ -339,9 +339,9 @@ def _parsed(text: str) -> Any:
 
 
 def _nearest(key: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(key, known, 1, 0.6)
-    if not near:  # the right name in the wrong group
-        near = [name for name in known if name.rpartition(".")[2] == key.rpartition(".")[2]]
+    # The right name in the wrong group comes before a like one in the right group.
+    near = [name for name in known if "." in key and name.rpartition(".")[2] == key.rpartition(".")[2]]
+    near = near or difflib.get_close_matches(key, known, 1, 0.6)
     return f"; did you mean {near[0]}?" if near else f"; there are {', '.join(known)}"
 
 

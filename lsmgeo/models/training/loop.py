@@ -32,7 +32,7 @@ from lsmgeo.models.training.optimising import (
 from lsmgeo.models.training.processes import any_true, check_agreement, gather
 from lsmgeo.models.training.randomness import random_state, restore_random_state
 from lsmgeo.models.training.signals import StopRequest, catch_stop
-from lsmgeo.models.training.starting import make_model, parameter_checksum, started
+from lsmgeo.models.training.starting import hold_folder, make_model, parameter_checksum, started
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -97,10 +97,14 @@ def train(config: TrainingConfig, out: str | os.PathLike[str], *, quiet: bool = 
     Raises:
         OptionError, DataError: settings or data that cannot be used.
         CheckpointError: the folder is another run's, or its checkpoints cannot be used, or the last one not be written.
-        TrainingError: losses or gradients were not finite, again and again; or processes do not start from the same.
+        TrainingError: losses or gradients were not finite, again and again; processes do not start from the same; or
+            another process trains in the folder.
     """
+    # One layer of the release never gets a gradient, and what convolves the state gets none from a single view.
+    has_idle_parameters = config.model.variant == "release" or config.data.view_range[0] == 1
     with (
-        started(config.run, has_idle_parameters=config.model.variant == "release") as accelerator,
+        started(config.run, has_idle_parameters=has_idle_parameters) as accelerator,
+        hold_folder(Path(out)) if accelerator.is_main_process else contextlib.nullcontext(),
         catch_stop() as stop,
     ):
         return _train(config, Path(out), accelerator, stop, quiet=quiet)

@@ -16,7 +16,7 @@ from lsmgeo.models.pictures import draw_depth, draw_voxels, tile
 
 __all__ = ["Example", "draw_examples"]
 
-SIZE = 128
+SIZE = 96
 THRESHOLD = 0.4
 ELEVATION = 25.0
 

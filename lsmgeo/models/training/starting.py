@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
 
-from lsmgeo.errors import OptionError
+from lsmgeo.errors import DataError, OptionError, TrainingError
 from lsmgeo.models.creating import create, settings_of
 from lsmgeo.models.model import Model
 from lsmgeo.models.training.config import ModelConfig, RunConfig
@@ -19,7 +21,7 @@ from lsmgeo.models.weights import load
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
-__all__ = ["make_model", "parameter_checksum", "started"]
+__all__ = ["hold_folder", "make_model", "parameter_checksum", "started"]
 
 
 @contextlib.contextmanager
@@ -28,7 +30,7 @@ def started(run: RunConfig, *, has_idle_parameters: bool) -> Iterator[Accelerato
 
     Args:
         run: says device and precision.
-        has_idle_parameters: whether some parameters never get a gradient.
+        has_idle_parameters: whether some parameters get no gradient, always or from some batches.
 
     Raises:
         OptionError: accelerate is not installed, or the device cannot compute in this precision.
@@ -43,9 +45,7 @@ def started(run: RunConfig, *, has_idle_parameters: bool) -> Iterator[Accelerato
     is_cpu = run.device == "cpu" or not torch.cuda.is_available()
     if run.precision == "fp16" and is_cpu:
         raise OptionError("run: precision must be 'no' or 'bf16' on a CPU; got 'fp16'")
-    options = DistributedDataParallelKwargs(
-        broadcast_buffers=False, gradient_as_bucket_view=True, find_unused_parameters=has_idle_parameters
-    )
+    options = DistributedDataParallelKwargs(gradient_as_bucket_view=True, find_unused_parameters=has_idle_parameters)
     was_distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
     AcceleratorState._reset_state(reset_partial_state=True)  # of another run in this process
     try:
@@ -54,6 +54,37 @@ def started(run: RunConfig, *, has_idle_parameters: bool) -> Iterator[Accelerato
         if not was_distributed and torch.distributed.is_available() and torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
         AcceleratorState._reset_state(reset_partial_state=True)
+
+
+@contextlib.contextmanager
+def hold_folder(folder: Path) -> Iterator[None]:
+    """Keep a run's folder for this process: two that trained in it would take each other's checkpoints away.
+
+    Raises:
+        TrainingError: another process holds it.
+        DataError: it cannot be written.
+    """
+    try:
+        import fcntl
+    except ImportError:  # not on Windows
+        yield
+        return
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise DataError(folder, f"cannot be written ({error})") from error
+    try:
+        # A lock of the process, which its workers do not inherit: it ends with the process, however that ends.
+        try:
+            fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError) as error:
+            raise TrainingError(f"another process trains in {folder}") from error
+        except OSError:  # a file system without locks
+            pass
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def make_model(config: ModelConfig, run: RunConfig, device: torch.device) -> Model:

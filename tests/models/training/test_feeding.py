@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import math
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ SYNTHETIC = DataConfig(source="synthetic-13", shapes=39, pool=4, views=(1, 3), p
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory):
     folder = tmp_path_factory.mktemp("shards")
-    render_set("synthetic-13", folder, Recipe(0, 4, 32, (16,)), shapes=39, jobs=1)
+    render_set("synthetic-13", folder, Recipe(0, 4, 32, (16,)), shapes=26, jobs=1)
     return folder
 
 
@@ -64,6 +63,7 @@ def tree_leaves(batch):
     return [leaf for leaf in torch.utils._pytree.tree_leaves(batch) if isinstance(leaf, torch.Tensor)]
 
 
+@pytest.mark.filterwarnings("ignore:This DataLoader will create 4 worker:UserWarning")
 @pytest.mark.parametrize("workers", [1, 4])
 def test_workers_change_nothing(stored, workers):
     expected = batches(opened(stored))
@@ -153,7 +153,7 @@ def test_evaluation_sees_every_shape_once_whatever_the_processes(shards):
 
 def test_rendering_when_needed_is_what_rendering_before_gives(shards):
     """The same shape, cameras and views: colours differ by a rounding to bytes, depth and voxels do not."""
-    config = DataConfig(source="synthetic-13", shapes=39, pool=4, views=4)
+    config = DataConfig(source="synthetic-13", shapes=26, pool=4, views=4)
     need = Need(32, 16, True)
     batch = batches(opened(config, need), 1)[0]
     shards = ShardSet(shards)
@@ -199,8 +199,9 @@ def test_another_size_of_images_keeps_the_geometry(size):
     batched = type(cameras)(*(torch.as_tensor(value)[None] for value in found.cameras))
     expected = scenes.render([ball], batched, lights)
     both = found.mask & expected.mask[0]
-    edge = math.pi * 0.5 * size * 60 * 0.4 / 2 / 16  # about the pixels on the outline
-    assert int((found.mask ^ expected.mask[0]).sum()) < 0.75 * edge
+    centers = [mask.nonzero()[:, 1:].double().mean(0) for mask in (found.mask, expected.mask[0])]
+    torch.testing.assert_close(*centers, rtol=0, atol=0.15)  # half a pixel would be a mistake
+    assert int(both.sum()) > 0.9 * int(expected.mask.sum())
     assert float((found.depth - expected.depth[0])[both].abs().median()) < 0.01
     assert bool((found.depth > 0).eq(found.mask).all())
 

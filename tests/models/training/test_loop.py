@@ -1,0 +1,248 @@
+"""The loop: what it learns from, when it ends, what it says and keeps."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from lsmgeo.data import Recipe, render_set
+from lsmgeo.errors import OptionError, TrainingError
+from lsmgeo.metrics import voxel_iou
+from lsmgeo.models import compute_loss, create, load
+from lsmgeo.models.training import (
+    DataConfig,
+    ModelConfig,
+    OptimiserConfig,
+    RunConfig,
+    TrainingConfig,
+    optimising,
+    read_config,
+    starting,
+)
+from lsmgeo.models.training.feeding import Need, open_shapes, validation_batches
+from tests.models.training import faults
+from tests.models.training.runs import configure, end_of, events, losses, run, write_shapes
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory):
+    return write_shapes(tmp_path_factory.mktemp("shards"))
+
+
+@pytest.fixture(scope="module")
+def plain(shards, tmp_path_factory):
+    """Three steps of four shapes."""
+    folder = tmp_path_factory.mktemp("plain")
+    run(configure(shards, steps=3, batch=4), folder)
+    return folder
+
+
+def assert_same_learning(folder, expected):
+    """Losses, gradients and weights of two runs agree as sums in another order do."""
+    for ours, theirs in zip(events(folder, "step"), events(expected, "step"), strict=True):
+        for name in ("step", "loss", "gradient_norm", "learning_rate"):
+            assert ours[name] == pytest.approx(theirs[name], rel=2e-4), (name, ours["step"])
+    (_, weights, _), (_, weights_there, _) = end_of(folder), end_of(expected)
+    torch.testing.assert_close(weights, weights_there, rtol=1e-3, atol=1e-3)
+
+
+def test_accumulated_batches_are_one_batch(shards, plain, tmp_path):
+    run(configure(shards, steps=3, batch=2, accumulation=2), tmp_path)
+    assert_same_learning(tmp_path, plain)
+
+
+def test_a_step_follows_the_gradient_of_the_mean_loss(shards, plain):
+    """The first logged loss and norm, from the model, the batch and torch alone."""
+    config = configure(shards, steps=3, batch=4)
+    shapes = open_shapes(config.data, Need(32, 16, False), seed=3, device=CPU, is_training=True)
+    from lsmgeo.models.training.feeding import training_batches
+
+    options = {"start": 0, "batch": 4, "workers": 0, "device": CPU, "rank": 0, "processes": 1}
+    batch = next(training_batches(shapes, seed=3, **options))
+    assert not batch.view_mask.all()  # scenes of one view and of two: steps weigh, not scenes
+    torch.manual_seed(3)
+    model = create("voxel-lsm", preset="tiny", **config.model.settings)
+    loss = compute_loss(model(batch.images, batch.cameras, batch.view_mask), batch)
+    loss.backward()
+    squares = [(p.grad.double() ** 2).sum() for p in model.parameters() if p.grad is not None]
+    expected = torch.stack(squares).sum() ** 0.5
+    first = events(plain, "step")[0]
+    assert first["loss"] == pytest.approx(loss.item(), rel=1e-5)
+    assert first["gradient_norm"] == pytest.approx(expected.item(), rel=1e-4)
+
+
+def test_long_gradients_are_cut(shards, plain, tmp_path):
+    """Adam of one step is deaf to scale, so the moments tell: the first is a tenth of the cut gradient."""
+    run(configure(shards, steps=1, batch=4, clip_norm=0.01), tmp_path)
+    assert events(tmp_path, "step")[0]["gradient_norm"] == pytest.approx(events(plain, "step")[0]["gradient_norm"])
+    _, _, optimiser = end_of(tmp_path)
+    moments = [state["exp_avg"] for state in optimiser["state"].values()]
+    assert float(torch.stack([(m.double() ** 2).sum() for m in moments]).sum() ** 0.5) == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_an_evaluation_is_what_its_log_says(shards, plain):
+    (line,) = events(plain, "evaluation")
+    assert line["step"] == 3
+    config = configure(shards)
+    shapes = open_shapes(config.data, Need(32, 16, False), seed=3, device=CPU, is_training=False, views=2)
+    model = load(plain)
+    found = {1: [], 2: []}
+    for batch in validation_batches(shapes, seed=3, count=2, batch=1, device=CPU):
+        with torch.no_grad():
+            output = model(batch.images, batch.cameras, batch.view_mask)
+        for view in found:
+            found[view].append(float(voxel_iou(output.logits[:, view - 1].sigmoid(), batch.occupancy)))
+    assert {int(view): value for view, value in line["iou"].items()} == pytest.approx(
+        {view: float(np.mean(values)) for view, values in found.items()}, rel=1e-4
+    )
+    assert line["per_category"] == pytest.approx({"chair": line["iou"]["2"]})
+
+
+@pytest.mark.parametrize("loss_views", ["random", "last"])
+def test_the_loss_of_some_views(shards, tmp_path, loss_views):
+    for name in ("first", "again"):
+        run(configure(shards, steps=2, loss_views=loss_views), tmp_path / name)
+    assert losses(tmp_path / "first") == losses(tmp_path / "again")
+    assert all(math.isfinite(loss) for loss in losses(tmp_path / "first").values())
+
+
+def test_random_views_cover_all():
+    run_config = RunConfig(steps=1, loss_views="random")
+    drawn = [optimising.loss_steps(run_config, step, 4) for step in range(60)]
+    assert {index for steps in drawn for index in steps} == {0, 1, 2, 3}
+    assert drawn == [optimising.loss_steps(run_config, step, 4) for step in range(60)]
+
+
+def test_what_a_run_leaves(shards, tmp_path):
+    config = configure(shards, steps=2, pictures=1, tensorboard=True)
+    trained = run(config, tmp_path)
+    assert (trained.step, trained.ended, trained.exit_code, trained.is_first) == (2, "steps", 0, True)
+    assert trained.checkpoint == tmp_path / "checkpoints" / "step_00000002"
+    assert read_config(tmp_path / "config.json").to_dict() == config.to_dict()
+    assert [line["event"] for line in events(tmp_path)] == [
+        *("start", "checkpoint", "step", "step", "evaluation", "checkpoint", "stop"),
+    ]
+    with Image.open(tmp_path / "pictures" / "predicted_00000002.png") as picture:
+        assert picture.size == (3 * 96 + 2 * 4, 2 * 96 + 4)  # 2 views and the truth; 2 rows of a shape
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    board = EventAccumulator(str(tmp_path / "tensorboard"))
+    board.Reload()
+    assert board.Tags()["images"] == ["predicted"]
+    assert [item.value for item in board.Scalars("train/loss")] == pytest.approx(list(losses(tmp_path).values()))
+    assert {"iou/1_views", "iou/2_views", "loss/held_back"} <= set(board.Tags()["scalars"])
+
+
+def test_the_best_is_kept(shards, tmp_path):
+    trained = run(configure(shards, steps=5, evaluate_every=1, keep=1), tmp_path)
+    values = {line["step"]: line["iou"]["2"] for line in events(tmp_path, "evaluation")}
+    assert trained.best == max(values, key=lambda step: values[step])
+    kept = {int(path.name[5:]) for path in (tmp_path / "checkpoints").glob("step_*")}
+    assert kept == {trained.best, 5}
+
+
+def test_depth_is_learnt_and_drawn(tmp_path):
+    render_set("synthetic-13", tmp_path / "shards", Recipe(0, 3, 32, (16,)), shapes=13, jobs=1)
+    config = TrainingConfig(
+        model=ModelConfig(name="depth-lsm", preset="tiny"),
+        data=DataConfig(source=str(tmp_path / "shards"), views=(1, 2), validation_split="train", limit=4, workers=0),
+        run=RunConfig(steps=1, batch=2, evaluate_shapes=2, evaluate_views=2, pictures=1, tensorboard=False),
+    )
+    trained = run(config, tmp_path / "run")
+    assert trained.evaluation.measure == "depth_error"
+    assert set(trained.evaluation.by_view) == {1, 2}
+    assert all(0 < value < 3 for value in trained.evaluation.by_view.values())
+    assert trained.evaluation.is_better_than(9.0)
+    assert not trained.evaluation.is_better_than(0.0)
+    with Image.open(tmp_path / "run" / "pictures" / "predicted_00000001.png") as picture:
+        assert picture.size == (2 * 96 + 4, 5 * 96 + 4 * 4)
+
+
+def test_minutes_end_a_run(shards, tmp_path):
+    trained = run(configure(shards, steps=None, minutes=1e-6), tmp_path)
+    assert (trained.ended, trained.step, trained.exit_code) == ("minutes", 0, 0)
+    # They count over resumes: three minutes were trained already.
+    trained = run(configure(shards, steps=1), tmp_path)
+    assert (trained.ended, trained.step) == ("steps", 1)
+
+
+def test_a_run_that_has_ended_has_nothing_to_do(shards, plain):
+    lines = len(events(plain, "step"))
+    trained = run(configure(shards, steps=3, batch=4), plain)
+    assert (trained.step, trained.ended, trained.evaluation) == (3, "steps", None)
+    assert len(events(plain, "step")) == lines
+
+
+def test_weights_to_begin_with(shards, plain, tmp_path):
+    config = configure(shards, steps=1, batch=4)
+    begun = dataclasses.replace(config, model=dataclasses.replace(config.model, weights=str(plain)))
+    run(begun, tmp_path / "run")
+    assert losses(tmp_path / "run")[1] != losses(plain)[1]
+    other = {**config.model.settings, "hidden_channels": 8}
+    with pytest.raises(OptionError, match="weights are of another model: hidden_channels is 4 in"):
+        run(dataclasses.replace(begun, model=dataclasses.replace(begun.model, settings=other)), tmp_path / "other")
+
+
+def test_two_runs_do_not_share_a_folder(shards, tmp_path):
+    """Another process holds the folder while this one would train in it."""
+    ready, wait = os.pipe(), os.pipe()
+
+    def hold():
+        with starting.hold_folder(tmp_path):
+            os.write(ready[1], b"1")
+            os.read(wait[0], 1)
+
+    child = faults.start(hold)
+    os.read(ready[0], 1)
+    try:
+        with pytest.raises(TrainingError, match="another process trains in"):
+            run(configure(shards, steps=1), tmp_path)
+    finally:
+        os.write(wait[1], b"1")
+        assert faults.wait(child) == 0
+    assert run(configure(shards, steps=1), tmp_path).step == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"precision": "fp16"}, "precision must be 'no' or 'bf16' on a CPU"),
+        ({"evaluate_views": 9}, "views; 9 are asked for"),
+    ],
+)
+def test_what_cannot_be_is_told_before_the_work(shards, tmp_path, changes, message):
+    with pytest.raises((OptionError, OSError), match=message):
+        run(configure(shards, **changes), tmp_path / "run")
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_the_work(shards, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="cannot be written"):
+        run(configure(shards), tmp_path / "file")
+
+
+def test_fewer_bits(shards, plain, tmp_path):
+    run(configure(shards, steps=3, batch=4, precision="bf16", channels_last=True), tmp_path)
+    for step, loss in losses(tmp_path).items():
+        assert loss == pytest.approx(losses(plain)[step], rel=0.05)
+    assert {tensor.dtype for tensor in end_of(tmp_path)[1].values()} == {torch.float32}
+
+
+def test_learning_rates():
+    config = OptimiserConfig(learning_rate=2.0, schedule="cosine", warm_up=10)
+    rates = [optimising.learning_rate(config, taken, 100) for taken in range(101)]
+    assert rates[0] == pytest.approx(0.2)
+    assert rates[50] == pytest.approx(1.0)
+    assert rates[100] == 0.0
+    assert rates[75] == pytest.approx(2.0 * 0.5 * (1 - math.sqrt(0.5)))
+    constant = OptimiserConfig(learning_rate=2.0)
+    assert {optimising.learning_rate(constant, taken, None) for taken in (0, 7, 10**6)} == {2.0}

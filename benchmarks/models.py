@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import copy
+import json
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -226,7 +227,7 @@ def rates(name: str, settings: Settings) -> list[dict[str, Any]]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--only", choices=tuple(MODELS), help="one model; nothing is kept")
+    parser.add_argument("--only", choices=tuple(MODELS), help="one model; its rows alone are replaced")
     options, others = parser.parse_known_args(argv)
     settings = parse(__doc__, others)
     names = [options.only] if options.only else list(MODELS)
@@ -236,8 +237,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         found = [case for name in names for case in rates(name, settings)]
         report.show(report.rate_rows(found), "models a second")
         cases += found
-    if options.only is None:
-        settings.save("models" if settings.device == "cpu" else "models_gpu", cases)
+    kept = "models" if settings.device == "cpu" else "models_gpu"
+    path = timing.RESULTS / f"{kept}.json"
+    if options.only and settings.folder is not None and path.is_file():
+        before = json.loads(path.read_text(encoding="utf-8"))["cases"]
+        others = [case for case in before if not case["case"].startswith(MODELS[options.only])]
+        cases = sorted((*others, *cases), key=lambda case: not case["case"].startswith(MODELS["voxel-lsm"]))
+    settings.save(kept, cases)
 
 
 if __name__ == "__main__":

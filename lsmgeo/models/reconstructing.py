@@ -211,11 +211,14 @@ def _with_voxels(
         camera, image = resize(scene.camera(view), *shape), resized(scene.load(view), shape)
         depth = hull_depth(fine > threshold, fine_grid, camera)
         numbers = [("model", f"{100 * float((depth > 0).float().mean()):.1f} % of the picture")]
+        coloured = depth
         if outline is not None:
             mask = resized(outline[None].float(), shape)[0] > 0.5
             iou = float((mask & (depth > 0)).sum()) / max(1, int((mask | (depth > 0)).sum()))
             numbers.append(("IoU of silhouette and model", f"{iou:.3f}"))
-        seen.append(HullView(view, image, camera, depth > 0, depth, 1.0))
+            # Where the model is too large, a photograph shows what is behind the object.
+            coloured = torch.where(mask, depth, 0.0)
+        seen.append(HullView(view, image, camera, coloured > 0, coloured, 1.0))
         certain = _largest(probability, coarse_grid, camera, found.placement)
         looked.append(Looked(view, image, camera, depth, certain, "probability", tuple(numbers)))
     mesh = drop_specks(extract_mesh(fine, fine_grid, level=threshold), SPECK_FACES)

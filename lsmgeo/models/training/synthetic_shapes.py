@@ -101,7 +101,7 @@ class SyntheticShapes(Dataset[Described]):
         chosen = np.argsort(generator.random(self.config.pool), kind="stable")[:count].tolist()
         shape = synthetic13.shape(self.config.set_seed, number)
         cameras = synthetic13.views(self.config.set_seed, number, self.config.pool, self.size)
-        cameras = CameraTensors(*(value[chosen] for value in camera_tools.as_tensors(cameras)))
+        cameras = CameraTensors(*(torch.as_tensor(value)[chosen] for value in camera_tools.as_tensors(cameras)))
         behind = [self.background(generator, self.size, self.size) for _ in chosen]
         return Described(
             shape.scene,

@@ -1,0 +1,77 @@
+"""``lsmgeo train``: what is printed, and how a wrong configuration is told."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+
+import pytest
+
+from lsmgeo import cli
+from lsmgeo.models import load
+from lsmgeo.models.training import loop
+from tests.models.training.runs import configure, write_shapes
+
+
+@pytest.fixture(scope="module")
+def configuration(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("train")
+    (folder / "shards").mkdir()
+    config = configure(write_shapes(folder / "shards"), steps=2)
+    (folder / "run.json").write_text(json.dumps(config.to_dict()))
+    return folder / "run.json"
+
+
+def test_a_model_is_trained_and_goes_on(configuration, tmp_path, capsys):
+    out = tmp_path / "run"
+    command = ["train", str(configuration), "--out", str(out), "--set", "run.steps=1"]
+    assert cli.main([*command, "--set", "run.log_every=1"]) == 0
+    printed = capsys.readouterr()
+    assert "ended:       at step 1, since all its steps are taken\n" in printed.out
+    checkpoint = out / "checkpoints" / "step_00000001"
+    assert f"checkpoint:  {checkpoint.resolve()}\n" in printed.out
+    assert f"evaluate:    lsmgeo evaluate {checkpoint}\n" in printed.out
+    assert "iou:" in printed.out
+    assert "6 shapes, 2 a step; evaluated on 2" in printed.err
+    assert load(out).name == "voxel-lsm"
+    assert cli.main(["train", str(configuration), "--out", str(out), "--quiet", "true"]) == 0
+    printed = capsys.readouterr()
+    assert "ended:       at step 2" in printed.out
+    assert printed.err == ""
+
+
+def test_a_signal_is_told_by_the_exit_status(configuration, tmp_path, capsys, monkeypatch):
+    find = loop.find_gradients
+
+    def find_gradients(*arguments, **options):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return find(*arguments, **options)
+
+    monkeypatch.setattr(loop, "find_gradients", find_gradients)
+    assert cli.main(["train", str(configuration), "--out", str(tmp_path)]) == 143
+    assert "go on:       the same command" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--set", "run.stepz=3"], "there is no run.stepz; did you mean run.steps?"),
+        (["--set", "data.source=/nowhere"], "/nowhere: cannot be read"),
+        (["--set", "model.preset=huge"], "preset must be one of"),
+        (["--set", "model.settings.grid_sise=8"], "there is no setting 'grid_sise'; is 'grid_size' meant?"),
+        (["--set", "model.settings.upsample=1"], "no voxels at the model's resolution 8"),
+        (["--set", "model.name=depth-lsm", "--set", "model.settings={}"], "source has no depth"),
+    ],
+)
+def test_what_cannot_be_trained_gives_one_line_and_status_2(configuration, tmp_path, capsys, arguments, message):
+    assert cli.main(["train", str(configuration), "--out", str(tmp_path / "run"), *arguments]) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith("lsmgeo: error: ")
+    assert message in printed.err
+    assert printed.err.count("\n") == 1
+
+
+def test_a_missing_configuration(tmp_path, capsys):
+    assert cli.main(["train", str(tmp_path / "none.toml")]) == 2
+    assert "none.toml: no such file" in capsys.readouterr().err

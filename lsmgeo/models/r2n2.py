@@ -182,7 +182,7 @@ class R2N2(Model):
 
     Source: Choy et al., "3D-R2N2: A Unified Approach for Single and Multi-view 3D Object Reconstruction", 2016, section
     3, layer by layer as released; with pose: Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017,
-    section 5. The original takes images of 127 pixels; Kar et al. trained it on theirs, of 224.
+    section 4. The original takes images of 127 pixels; Kar et al. trained it on theirs, of 224.
 
     Convention:
         The quaternion is that of the world-to-camera rotation. Of its two signs the one with z >= 0 is taken: the real

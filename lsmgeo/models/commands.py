@@ -136,8 +136,10 @@ def train(configuration: str, out: str = "lsmgeo-run", set: list[str] | None = N
             values = ", ".join(f"{value:.4f}" for value in found.by_view.values())
             print(f"{found.measure.replace('_', ' ') + ':':<13}{values} after 1 to {len(found.by_view)} views")
         print(f"checkpoint:  {trained.checkpoint.resolve()}")
-        if trained.best not in (None, trained.step):
-            print(f"best:        {trained.checkpoint.with_name(f'step_{trained.best:08d}').resolve()}")
+        best = None if trained.best is None else trained.checkpoint.with_name(f"step_{trained.best:08d}")
+        # A full disk may have had no room for it.
+        if trained.best != trained.step and best is not None and best.is_dir():
+            print(f"best:        {best.resolve()}")
         print(f"log:         {(Path(out) / 'log.jsonl').resolve()}; tensorboard --logdir {Path(out).resolve()}")
         print(f"evaluate:    lsmgeo evaluate {trained.checkpoint}")
         if trained.ended == "stop":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -86,11 +87,7 @@ class RunLog:
             return
         line = json.dumps({"event": name, **_plain(values), "time": round(time.time(), 3)}, allow_nan=False)
         try:
-            descriptor = os.open(self.folder / LOG, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-            try:
-                os.write(descriptor, line.encode() + b"\n")
-            finally:
-                os.close(descriptor)
+            _append_line(self.folder / LOG, line.encode())
         except OSError as error:
             self._warn(LOG, f"{self.folder / LOG}: cannot be written ({error}); the run goes on")
 
@@ -188,6 +185,21 @@ class RunLog:
         if what not in self._warned:
             self._warned.add(what)
             warnings.warn(message, stacklevel=3)
+
+
+def _append_line(path: Path, line: bytes) -> None:
+    """Append a whole line, or raise and leave the file as it was."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
+    try:
+        size = os.fstat(descriptor).st_size
+        # A loss of power may have left half a line.
+        begin = b"\n" if size and os.pread(descriptor, 1, size - 1) != b"\n" else b""
+        content = begin + line + b"\n"
+        if os.write(descriptor, content) < len(content):  # there was room for a part
+            os.ftruncate(descriptor, size)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    finally:
+        os.close(descriptor)
 
 
 def _short(value: float) -> float:

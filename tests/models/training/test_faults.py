@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import resource
@@ -392,6 +393,26 @@ def test_a_log_that_cannot_be_written_is_told_once_and_costs_nothing(config, who
         run(config, begun)
     assert len(told) == 1
     assert_same_end(begun, whole)
+
+
+@pytest.mark.parametrize("before", [b"", b'{"event": "step", "st'])
+def test_lines_of_the_log_are_whole_on_a_disk_with_room_for_half_a_line(tmp_path, before):
+    """And where a loss of power left half a line, the next begins anew."""
+    path = tmp_path / "log.jsonl"
+    path.write_bytes(before)
+
+    def work() -> None:
+        log = log_module.RunLog(tmp_path, step=0, steps=None, tensorboard=False, quiet=True)
+        log.event("first", value=1)
+        limit(path.stat().st_size + 10)
+        with pytest.warns(UserWarning, match=r"log.jsonl: cannot be written"):
+            log.event("second", value=2)
+        limit(resource.RLIM_INFINITY)
+        log.event("third", value=3)
+
+    assert in_child(work) == 0
+    lines = [line for line in path.read_bytes().splitlines() if line != before]
+    assert [json.loads(line)["event"] for line in lines] == ["first", "third"]
 
 
 def test_checkpoints_that_vanish_are_written_again(config, whole, begun, monkeypatch):

@@ -17,15 +17,15 @@ __all__ = ["draw_depth", "draw_points", "draw_voxels", "tile"]
 
 BACKGROUND = 1.0
 COLOUR = (0.42, 0.60, 0.84)
-# Where light comes from, in the viewer's axes (x right, y down, z forward): the left, above, and behind.
-LIGHT = np.array([-0.45, -0.75, -0.6]) / np.linalg.norm([-0.45, -0.75, -0.6])
-AMBIENT = 0.35
+# Where light comes from, in the viewer's axes (x right, y down, z forward): the left, above, and behind; of length 1.
+LIGHT = np.array([-0.3, -0.7, -0.648])
+AMBIENT = 0.4
 # Pixels of a side that one drawn pixel is the mean of.
 FINER = 2
 # Half the side of what is seen of the unit cube's world.
 REACH = 0.56
-# Dots at once, which bounds the memory of a picture.
-MOST_DOTS = 1 << 24
+# Dots along the side of a quad; only ones much larger than the picture would need more.
+MOST_DOTS = 1 << 10
 ANGLES = ("azimuth", "elevation")
 # Between neighbouring pixels whose points are farther apart than this many of their widths there is no surface.
 STEEPEST = 10.0
@@ -199,21 +199,28 @@ def _splat(quads: Floats, colours: Floats, view: Floats, size: int, reach: float
     picture = np.full((fine * fine, 3), BACKGROUND)
     if len(quads):
         scale = fine / (2 * reach)
-        seen = _dots(quads, scale).reshape(-1, 3) @ view.T
+        dots, owner = _dots(quads, scale)
+        seen = dots @ view.T
         column, row = (np.floor(seen[:, axis] * scale + fine / 2).astype(np.int64) for axis in (0, 1))
         inside = (column >= 0) & (column < fine) & (row >= 0) & (row < fine)
         order = np.flatnonzero(inside)[np.argsort(-seen[inside, 2], kind="stable")]
-        picture[row[order] * fine + column[order]] = colours[order // (len(seen) // len(quads))]
+        picture[row[order] * fine + column[order]] = colours[owner[order]]
     return _averaged(picture.reshape(fine, fine, 3))
 
 
-def _dots(quads: Floats, scale: float) -> Floats:
-    """Dots (Q, N, 3) of quads, so dense that nothing shows between them at so many pixels a unit."""
-    widest = float(np.linalg.norm(quads - np.roll(quads, 1, 1), axis=-1).max())
-    number = int(np.clip(np.ceil(1.5 * scale * widest), 2, np.sqrt(MOST_DOTS / len(quads)) + 2))
-    middles = (np.arange(number) + 0.5) / number
-    s, t = (axis.reshape(-1) for axis in np.meshgrid(middles, middles))
-    return np.asarray(np.stack(((1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t), 1) @ quads)
+def _dots(quads: Floats, scale: float) -> tuple[Floats, npt.NDArray[np.int64]]:
+    """Dots (N, 3) so dense that nothing shows between them at so many pixels a unit, and the quad (N,) of each."""
+    widest = np.linalg.norm(quads - np.roll(quads, 1, 1), axis=-1).max(-1)
+    levels = np.ceil(np.clip(1.2 * scale * widest, 2, MOST_DOTS)).astype(np.int64)
+    dots, owner = [], []
+    for level in np.unique(levels):
+        some = np.flatnonzero(levels == level)
+        middles = (np.arange(level) + 0.5) / level
+        s, t = (axis.reshape(-1) for axis in np.meshgrid(middles, middles))
+        weights = np.stack(((1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t), 1)
+        dots.append((weights @ quads[some]).reshape(-1, 3))
+        owner.append(np.repeat(some, len(weights)))
+    return np.concatenate(dots), np.concatenate(owner)
 
 
 def draw_points(

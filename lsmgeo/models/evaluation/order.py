@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 
 from lsmgeo.cameras import CameraTensors
-from lsmgeo.metrics import voxel_iou
 from lsmgeo.models.evaluation.contenders import Contender, one_resolution, pick
 from lsmgeo.models.evaluation.facts import facts_of
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.plots import Curve, draw_curves
 from lsmgeo.models.evaluation.report import Cell, Report, Row, Table
-from lsmgeo.models.evaluation.scores import Scores
+from lsmgeo.models.evaluation.scores import Scores, iou_by_view
 from lsmgeo.models.evaluation.shapes import ORDER, Shapes, batches, generator_of
 
 __all__ = ["report_order"]
@@ -23,7 +22,11 @@ VIEWS = 8
 COUNTS = (2, 4, 8, 12, 16, 20)
 # Of a shape's IoU over the orders: mean, standard deviation, range; of its voxels: deviation of probabilities, and the
 # share of those that are occupied in some order that are not in another.
-MEASURES = ("mean IoU [%]", "deviation [points]", "range [points]", "deviation of voxels [%]", "voxels that change [%]")
+MEASURES = (
+    "mean IoU [%]", "deviation [points]", "range [points]", "deviation of voxels [%]", "voxels that change [%]"
+)  # fmt: skip
+# By how much the mean IoU of the whole set differs between the best and the worst of the orders.
+OF_THE_SET = "range of the set [points]"
 
 
 def report_order(contenders: Sequence[Contender], shapes: Shapes, options: Options) -> Report:
@@ -31,7 +34,7 @@ def report_order(contenders: Sequence[Contender], shapes: Shapes, options: Optio
 
     The first 2, 4 and 8 views of every shape are given in several random orders. Measured are, per shape, the standard
     deviation and the range of IoU over the orders; the deviation of each voxel's probability, averaged over the voxels
-    that are occupied in any order; and the share of these that are empty in another.
+    that are occupied in any order; the share of these that are empty in another; and the range of the whole set's IoU.
 
     Args:
         contenders: voxel models of one resolution.
@@ -49,6 +52,7 @@ def report_order(contenders: Sequence[Contender], shapes: Shapes, options: Optio
     most = options.views_of(VIEWS, shapes.most_views, notes)
     counts = [count for count in COUNTS if count < most] + ([most] if most > 1 else [])
     scores = {(contender.name, count): Scores() for contender in contenders for count in counts}
+    every_order = {key: Scores() for key in scores}
     resolution = one_resolution(contenders)
     for batch in batches(shapes, most, options.batch, resolution=resolution, progress=options.progress):
         assert batch.occupancy is not None
@@ -59,14 +63,24 @@ def report_order(contenders: Sequence[Contender], shapes: Shapes, options: Optio
                     contender.occupancies(*_reordered(batch.images, batch.cameras, orders[:, turn]), every=False)
                     for turn in range(options.orders)
                 ]
-                measured = _spread(torch.stack(found, 1), batch.occupancy, options.threshold)
-                scores[contender.name, count].add(batch.name, batch.category, measured)
+                together = torch.stack(found, 1)
+                iou = iou_by_view(together, batch.occupancy, options.threshold)
+                key = (contender.name, count)
+                every_order[key].add(batch.name, batch.category, iou)
+                scores[key].add(batch.name, batch.category, _spread(together, iou, options.threshold))
     tables, curves = [], []
     for contender in contenders:
         cells = {count: scores[contender.name, count].cells(100) for count in counts}
-        rows = [Row(f"{count} views", cells[count]) for count in counts]
+        means = {count: [cell.value for cell in every_order[contender.name, count].cells(100)] for count in counts}
+        rows = [Row(f"{count} views", [*cells[count], Cell(max(means[count]) - min(means[count]))]) for count in counts]
         tables.append(
-            Table(f"order of {contender.name}", f"{contender.name}, {options.orders} orders", MEASURES, rows, 2)
+            Table(
+                f"order of {contender.name}",
+                f"{contender.name}, {options.orders} orders",
+                (*MEASURES, OF_THE_SET),
+                rows,
+                2,
+            )
         )
         bars = [Cell(cells[count][0].value, cells[count][1].value / 2) for count in counts]  # drawn twice as long
         curves.append(Curve(contender.name, counts, bars))
@@ -107,9 +121,8 @@ def _reordered(images: Tensor, cameras: CameraTensors, order: Tensor) -> tuple[T
     return images[rows, order], CameraTensors(*(torch.as_tensor(field)[rows, order] for field in cameras))
 
 
-def _spread(predicted: Tensor, occupancy: Tensor, threshold: float) -> Tensor:
-    """The measures (B, 5) of predictions (B, orders, D, H, W)."""
-    iou = voxel_iou(predicted, occupancy[:, None].expand(predicted.shape), threshold=threshold)
+def _spread(predicted: Tensor, iou: Tensor, threshold: float) -> Tensor:
+    """The measures (B, 5) of predictions (B, orders, D, H, W) with their IoU (B, orders)."""
     solid = predicted > threshold
     ever, always = solid.any(1).flatten(1), solid.all(1).flatten(1)
     number = ever.sum(1).clamp_min(1)

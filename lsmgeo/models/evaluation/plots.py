@@ -67,8 +67,7 @@ def draw_curves(
             curve.places, values, reach, marker="o", ms=4, lw=1.6, capsize=2, color=colour[curve.name], label=curve.name
         )
     has_bars = any(cell.error > 0 for curve in curves for cell in curve.cells)
-    figure.suptitle(title, fontsize=11)
-    axes.set_title(data + f"; bars: {bars}" * has_bars, fontsize=8, color="0.35", wrap=True)
+    axes.set_title(f"{title}\n{data}" + f"; bars: {bars}" * has_bars, fontsize=9, loc="left")
     axes.set_xlabel(across)
     axes.set_ylabel(up)
     axes.set_xticks(sorted({place for curve in curves for place in curve.places}))

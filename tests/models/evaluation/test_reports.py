@@ -152,7 +152,8 @@ def test_order_measures_the_spread_over_orders():
     scores = [1.0 if first < 0.075 else 0.5 for first in firsts]
     assert len(scores) == 6
     assert set(scores) == {0.5, 1.0}
-    mean, deviation, reach, voxels, changing = values(report, "order of fake", "2 views")
+    mean, deviation, reach, voxels, changing, of_the_set = values(report, "order of fake", "2 views")
+    np.testing.assert_allclose(of_the_set, 50.0)  # of one shape
     np.testing.assert_allclose([mean, deviation, reach], [100 * np.mean(scores), 100 * np.std(scores, ddof=1), 50.0])
     # Of the 256 voxels that are ever occupied half go from 0.41 to 0.39.
     np.testing.assert_allclose(changing, 50.0)
@@ -162,7 +163,7 @@ def test_order_measures_the_spread_over_orders():
 def test_a_model_that_minds_no_order_has_no_spread():
     report = evaluate([Contender("fake", FakeVoxels(by_count))], slabs(), "order", Options(views=4, orders=3))
     for row in ("2 views", "4 views"):
-        assert values(report, "order of fake", row)[1:] == [0.0] * 4
+        assert values(report, "order of fake", row)[1:] == [0.0] * 5
 
 
 def test_depth_counts_the_pixels_that_plane_sweep_has(monkeypatch):

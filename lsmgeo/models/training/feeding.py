@@ -93,7 +93,7 @@ def open_shapes(
             noise=noise,
         )
         on_device = device.type != "cpu"
-        return Shapes(rendered, Renderer(need.depth, device), _identity(rendered.names), on_device)
+        return Shapes(rendered, Renderer(need.depth, device, on_device), _identity(rendered.names), on_device)
     shards = ShardSet(config.source)
     _check_content(shards, need)
     dataset: Dataset[Any] = ShapeDataset(

@@ -154,9 +154,11 @@ def _train(
         rank=rank,
         processes=processes,
     )
+    # About how many terms the loss of a batch has.
     terms = run.batch * (need.voxels**3 if need.voxels else most * need.image_size**2)
     saved = None if checkpoint is None else checkpoint.path
     saved_step = None if checkpoint is None else checkpoint.step
+    weights = sum(parameter.numel() for parameter in model.parameters())
     evaluation: Evaluation | None = None
     ended = ""
     begin = time.monotonic() - place.seconds
@@ -210,14 +212,14 @@ def _train(
             "start" if checkpoint is None else "resume",
             step=place.step,
             model=settings_of(model),
-            parameters=sum(parameter.numel() for parameter in model.parameters()),
+            parameters=weights,
             shapes=len(shapes),
             held_back=min(run.evaluate_shapes, len(held_back)),
             processes=processes,
             device=str(device),
         )
         log.say(
-            f"{model.name}, {sum(parameter.numel() for parameter in model.parameters()):,} parameters, on {device}"
+            f"{model.name}, {weights:,} parameters, on {device}"
             f"{f', {processes} processes' if processes > 1 else ''}: {len(shapes)} shapes, {taken_a_step} a step; "
             f"evaluated on {min(run.evaluate_shapes, len(held_back))}"
             f"{'' if checkpoint is None else f'; goes on at step {place.step} of {checkpoint.path}'}"
@@ -273,7 +275,7 @@ def _train(
                 continue
             assert taken is not None
 
-            found_gradients = find_gradients(
+            gradients = find_gradients(
                 wrapped,
                 taken,
                 optimiser,
@@ -284,21 +286,21 @@ def _train(
             )
             place.step += 1
             rate = learning_rate(config.optimiser, place.moved, run.steps)
-            if found_gradients.is_finite:
+            if gradients.is_finite:
                 guard.admits(place.step, is_bad=False)
-                move_parameters(optimiser, accelerator, found_gradients, rate=rate, clip=config.optimiser.clip_norm)
+                move_parameters(optimiser, accelerator, gradients, rate=rate, clip=config.optimiser.clip_norm)
                 place.moved += 1
             else:
                 names = [name for part in gather([name for batch in taken for name in batch.name]) for name in part]
                 log.event(
                     "skipped",
                     step=place.step,
-                    loss=found_gradients.loss,
-                    gradient_norm=found_gradients.norm,
+                    loss=gradients.loss,
+                    gradient_norm=gradients.norm,
                     shapes=names,
                 )
                 log.say(f"step {place.step}: the loss or the gradient is not finite; skipped")
-                is_scaled = accelerator.scaler is not None and are_finite(found_gradients.loss)
+                is_scaled = accelerator.scaler is not None and are_finite(gradients.loss)
                 scale = accelerator.scaler.get_scale() if is_scaled else None
                 try:
                     guard.admits(place.step, is_bad=True, names=names, scale=scale)
@@ -315,13 +317,13 @@ def _train(
                 log.step(
                     place.step,
                     epoch=place.step * taken_a_step / len(shapes),
-                    loss=found_gradients.loss,
-                    gradient_norm=found_gradients.norm,
+                    loss=gradients.loss,
+                    gradient_norm=gradients.norm,
                     learning_rate=rate,
                     seconds=seconds,
                     waited=waited,
                 )
-            log.progress(place.step, f"loss {found_gradients.loss:.4f}, {seconds:.2f} s a step")
+            log.progress(place.step, f"loss {gradients.loss:.4f}, {seconds:.2f} s a step")
         log.event("stop", step=place.step, reason=ended, seconds=round(place.seconds, 1))
     assert saved is not None
     return Trained(folder, place.step, saved, place.best, evaluation, ended, rank == 0, stop.exit_code)

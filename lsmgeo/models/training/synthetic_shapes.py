@@ -117,14 +117,21 @@ class SyntheticShapes(Dataset[Described]):
 
 @dataclass(frozen=True)
 class Renderer:
-    """Makes a batch of described shapes: on a GPU all at once."""
+    """Makes a batch of described shapes.
+
+    Attributes:
+        depth: whether depth is kept.
+        device: what renders.
+        at_once: whether all views are rendered in one call, as suits a GPU; a CPU renders them one by one in any case.
+    """
 
     depth: bool
     device: torch.device
+    at_once: bool
 
     def __call__(self, shapes: Sequence[Described]) -> Batch:
         """Render."""
-        if self.device.type == "cpu":  # views are rendered one by one there, and none is rendered to be thrown away
+        if not self.at_once:  # no view is rendered to be thrown away
             return collate([self._sample(shape) for shape in shapes])
         most = max(len(shape.backgrounds) for shape in shapes)
         counts = torch.tensor([len(shape.backgrounds) for shape in shapes])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 
 import numpy as np
@@ -76,6 +77,17 @@ def test_workers_render_the_same():
         assert_equal(found, one)
 
 
+@pytest.mark.parametrize("workers", [0, 1])
+def test_rendering_all_views_at_once_is_the_same(workers):
+    """What a GPU does, on the CPU: scenes come from the workers, shapes have two or three lights, views are ragged."""
+    one_by_one = opened(SYNTHETIC, Need(32, 16, True))
+    renderer = dataclasses.replace(one_by_one.collate, at_once=True)
+    at_once = dataclasses.replace(one_by_one, collate=renderer, on_device=True)
+    for found, expected in zip(batches(at_once, 2, workers=workers), batches(one_by_one, 2), strict=True):
+        assert not expected.view_mask.all()
+        assert_equal(found, expected)
+
+
 @pytest.mark.parametrize("start", [0, 4, 20, 24])
 def test_reading_goes_on_from_any_sample(stored, start):
     shapes = opened(stored)
@@ -116,9 +128,7 @@ def test_views_are_ragged_and_in_random_order(stored):
 
 
 def test_pose_noise_turns_cameras_about_the_object(stored, shards):
-    from dataclasses import replace
-
-    quiet = batches(opened(replace(stored, pose_noise=0.0)), 1)[0]
+    quiet = batches(opened(dataclasses.replace(stored, pose_noise=0.0)), 1)[0]
     noisy = batches(opened(stored), 1)[0]
     torch.testing.assert_close(noisy.images, quiet.images, rtol=0, atol=0)
     R, S = (batch.cameras.cam_from_world[..., :3, :3].double() for batch in (noisy, quiet))
@@ -129,7 +139,7 @@ def test_pose_noise_turns_cameras_about_the_object(stored, shards):
     centers = [batch.cameras.cam_from_world[..., :3, 3] for batch in (noisy, quiet)]
     torch.testing.assert_close(*centers, rtol=1e-5, atol=1e-5)  # the origin stays where it was
     held_back = opened(stored, is_training=False)
-    plain = opened(replace(stored, pose_noise=0.0), is_training=False)
+    plain = opened(dataclasses.replace(stored, pose_noise=0.0), is_training=False)
     both = [next(validation_batches(s, seed=0, count=2, batch=2, device=CPU)) for s in (held_back, plain)]
     assert_equal(*both)
 

@@ -33,7 +33,7 @@ TABLES: dict[str, Callable[[list[dict[str, Any]]], report.Rows]] = {
     "models": report.model_rows,
 }
 # Figures of the plot directive, and the results that they draw.
-PLOTS = {"benchmark_growth": "growth", "classical_density": "classical"}
+PLOTS = {"benchmark_growth": "growth", "classical_density": "classical", "training_curve": "vlsm_compact"}
 
 
 def load(name: str) -> dict[str, Any] | None:

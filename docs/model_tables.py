@@ -1,0 +1,169 @@
+"""Directives that read the learnt models: their layers, their presets, and every key of a training configuration."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from dataclasses import MISSING, fields
+from typing import Any
+
+from benchmark_tables import RESULTS, list_table, load
+from docutils import nodes
+from docutils.statemachine import StringList
+from network_tracing import Stage, traced
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+from lsmgeo.models import create
+from lsmgeo.models.presets import PRESETS, RELEASES
+from lsmgeo.models.training import config as configuration
+
+GROUPS = configuration.GROUPS
+
+
+def layer_rows(name: str, preset: str, variant: str) -> list[list[str]]:
+    """Every stage of a model: what it reads and does, what it gives, its parameters."""
+    stages = traced(name, preset, variant)
+    rows = [["stage", "what it does", "reads", "gives", "parameters"]]
+    for before, stage in zip((None, *stages), stages, strict=False):
+        reads = [f"``{source}``" for source in stage.sources]
+        if before is not None and stage.sources == [before.name]:
+            reads = ["the one before"]
+        rows.append([f"``{stage.name}``", stage.what, ", ".join(reads), shape_text(stage), number(stage.parameters)])
+    total = sum(stage.parameters for stage in stages)
+    return [*rows, ["**all**", "", "", "", number(total)]]
+
+
+def shape_text(stage: Stage) -> str:
+    return " x ".join(map(str, stage.shape))
+
+
+def number(value: int) -> str:
+    return f"{value:,}" if value else ""
+
+
+def preset_rows() -> list[list[str]]:
+    """Every preset of every model, built and counted."""
+    rows = [["model", "preset", "image", "grid of the fusion", "result", "parameters"]]
+    for name, presets in PRESETS.items():
+        chosen = [(preset, "paper") for preset in presets] + ([("paper", "release")] if name in RELEASES else [])
+        for preset, variant in chosen:
+            model = create(name, preset=preset, variant=variant)
+            fused = getattr(model.settings, "grid_size", None) or model.settings.coarse
+            side = model.image_size
+            result = f"{model.resolution}\\ :sup:`3` voxels" if model.output == "voxels" else f"depth, {side} x {side}"
+            parameters = number(sum(weights.numel() for weights in model.parameters()))
+            title = f'``{preset}``, ``variant="{variant}"``' if variant != "paper" else f"``{preset}``"
+            rows.append([f"``{name}``", title, f"{side} x {side}", f"{fused}\\ :sup:`3`", result, parameters])
+    return rows
+
+
+def config_rows(group: str) -> list[list[str]]:
+    """Every key of a group of the training configuration, with its default and what its class says of it."""
+    form = GROUPS[group]
+    told = attributes_of(form)
+    rows = [["key", "default", "what it is"]]
+    for item in fields(form):
+        default = item.default if item.default is not MISSING else item.default_factory()  # type: ignore[misc]
+        rows.append([f"``{group}.{item.name}``", f"``{default!r}``", as_rst(told[item.name])])
+    return rows
+
+
+def attributes_of(form: type) -> dict[str, str]:
+    """What a class's docstring says of its attributes."""
+    text = inspect.getdoc(form) or ""
+    section = text.partition("Attributes:\n")[2]
+    return {
+        name: " ".join(words.split()) for name, words in re.findall(r"(?ms)^    (\w+): (.*?)(?=^    \w+: |\Z)", section)
+    }
+
+
+def as_rst(text: str) -> str:
+    """Names between single quotes of code stay code, where they would link to nothing."""
+    return re.sub(r"(?<!`)`([^`.]+)`(?!`)", r"``\1``", text)
+
+
+def curve_rows(found: dict[str, Any]) -> list[list[str]]:
+    """IoU of the last evaluation and on the test shapes, of the model and of visual hulls."""
+    measured, last = found["evaluation"], found["log"][-1]
+    views = measured["views"]
+    rows = [["IoU, %", *(f"{view} view{'s' * (view > 1)}" for view in views)]]
+    rows += [[name, *(f"{value:.1f}" for value in values)] for name, values in measured["iou"].items()]
+    held_back = [f"{100 * last['iou'][str(view)]:.1f}" if str(view) in last["iou"] else "" for view in views]
+    return [*rows, ["in training, held back", *held_back]]
+
+
+def curve_text(found: dict[str, Any]) -> str:
+    """What the curve is of."""
+    settings, last = found["settings"], found["log"][-1]
+    return (
+        f"{found['parameters']:,} parameters, {found['shapes']:,} shapes; {last['step']:,} steps of "
+        f"{settings['run']['batch']} shapes with {settings['data']['views']} views in {last['seconds'] / 60:.0f} "
+        f"minutes, evaluations included, on {found['machine']['device']}; the curve is of {found['held_back']} shapes held "
+        f"back, the table of {found['evaluation']['data']}."
+    )
+
+
+class Rows(SphinxDirective):
+    """A directive that is a table."""
+
+    optional_arguments = 3
+
+    def rows(self) -> list[list[str]]:
+        raise NotImplementedError
+
+    def run(self) -> list[nodes.Node]:
+        lines = [line.replace("   :class: benchmark", "   :class: layers") for line in list_table(self.rows())]
+        return self.parse_text_to_nodes(StringList(lines, source=str(self.name)))
+
+
+class Layers(Rows):
+    """``.. model-layers:: voxel-lsm paper release``."""
+
+    def rows(self) -> list[list[str]]:
+        name, preset, variant = (*self.arguments, *("paper", "paper")[len(self.arguments) - 1 :])
+        return layer_rows(name, preset, variant)
+
+
+class Presets(Rows):
+    """``.. model-presets::``."""
+
+    def rows(self) -> list[list[str]]:
+        return preset_rows()
+
+
+class Config(Rows):
+    """``.. training-config:: run``."""
+
+    def rows(self) -> list[list[str]]:
+        return config_rows(self.arguments[0])
+
+
+class Curve(SphinxDirective):
+    """``.. training-curve::``: what was measured of the run whose curve is drawn."""
+
+    def run(self) -> list[nodes.Node]:
+        found = load("vlsm_compact")
+        self.env.note_dependency(str(RESULTS / "vlsm_compact.json"))
+        if found is None:
+            lines = ["*Not measured yet: there is no* ``benchmarks/results/vlsm_compact.json``."]
+        else:
+            lines = [curve_text(found), "", *list_table(curve_rows(found))]
+        return self.parse_text_to_nodes(StringList(lines, source=str(self.name)))
+
+
+def name_fault(
+    role: str, raw: str, text: str, line: int, inliner: Any, options: Any = None, content: Any = None
+) -> tuple[list[nodes.Node], list[nodes.Node]]:
+    """A test of tests/models/training by the words of its name."""
+    words = text.rpartition("::")[2].removeprefix("test_").replace("_", " ")
+    return [nodes.emphasis(raw, words)], []
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    app.add_directive("training-curve", Curve)
+    app.add_role("fault", name_fault)
+    app.add_directive("model-layers", Layers)
+    app.add_directive("model-presets", Presets)
+    app.add_directive("training-config", Config)
+    return {"version": "1", "parallel_read_safe": True}

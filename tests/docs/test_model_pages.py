@@ -1,0 +1,175 @@
+"""The pages of the models are made from the models, and the guides name what exists."""
+
+import ast
+import inspect
+import json
+import re
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+
+from benchmarks import training_curve
+from lsmgeo import cli
+from lsmgeo.models import commands, create
+from lsmgeo.models.evaluation import REPORTS
+from lsmgeo.models.training.config import GROUPS, read_config
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+GUIDES = {name: (DOCS / f"{name}.rst").read_text(encoding="utf-8") for name in ("training", "evaluation")}
+PAGES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((DOCS / "models").glob("*.rst"))}
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+COMMANDS = {
+    "train": commands.train, "evaluate": commands.evaluate, "reconstruct": cli.reconstruct, "render": cli.render,
+    "convert": cli.convert,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def docs_on_path():
+    before = list(sys.path)
+    sys.path[:0] = [str(DOCS), str(DOCS / "figures")]
+    yield
+    sys.path[:] = before
+
+
+@pytest.mark.parametrize("name", ["voxel-lsm", "depth-lsm", "r2n2", "r2n2-pose"])
+def test_a_table_holds_every_parameter_and_a_drawing_every_stage(name):
+    import model_tables
+    import networks
+
+    _, *rows, (total_name, *_, total) = model_tables.layer_rows(name, "tiny", "paper")
+    parameters = [int(row[-1].replace(",", "")) for row in rows if row[-1]]
+    expected = sum(weights.numel() for weights in create(name, preset="tiny").parameters())
+    assert total_name == "**all**"
+    assert int(total.replace(",", "")) == sum(parameters) == expected
+    plt.switch_backend("Agg")
+    axes = networks.draw(name, "tiny")
+    drawn = {text.get_text() for text in axes.texts}
+    plt.close("all")
+    assert {f"{number:,}" for number in parameters if number > 100} <= drawn
+
+
+def test_skip_connections_are_found():
+    from network_tracing import traced
+
+    stages = {stage.name: stage for stage in traced("depth-lsm", "tiny")}
+    assert stages["image_encoder.out"].sources == ["image_encoder.up.0", "image_encoder.down.0"]
+    assert stages["grid_network.down.0"].sources == ["fusion"]
+    assert stages["rise.0"].sources == ["image_encoder.down.1", "rays.2"]
+    assert stages["images"].shape == (3, 32, 32)
+    assert stages["unproject"].shape == (8 + 1 + 3, 8, 8, 8)
+    pose = {stage.name: stage for stage in traced("r2n2-pose", "tiny")}
+    assert pose["recurrence"].sources == ["vector", "rotation.2"]
+    last = traced("voxel-lsm", "tiny")
+    assert last[-2].sources == ["grid_network.up.1", "fusion"]
+    assert (last[-1].name, last[-1].shape) == ("occupancy", (1, 16, 16, 16))
+
+
+def test_every_key_of_a_configuration_is_described():
+    import model_tables
+
+    for group, form in GROUPS.items():
+        told = model_tables.attributes_of(form)
+        assert list(told) == [item.name for item in fields(form)]
+        assert all(len(text) > 5 for text in told.values())
+        assert f".. training-config:: {group}\n" in GUIDES["training"]
+
+
+@pytest.mark.parametrize("page", ["training", "evaluation", "readme"])
+def test_commands_and_their_options_exist(page):
+    text = README if page == "readme" else GUIDES[page]
+    found = re.findall(r"lsmgeo(?:\.cli)? (train|evaluate|reconstruct|render|convert) ([^`\n]*)", text)
+    assert found
+    for command, arguments in found:
+        options = set(re.findall(r"--([a-z][a-z_]*)", arguments.partition("  #")[0]))
+        assert options <= set(inspect.signature(COMMANDS[command]).parameters), command
+    for path in re.findall(r"examples/[\w/]+\.(?:toml|py)", text):
+        assert (ROOT / path).is_file(), path
+    for key in re.findall(r"--set ([a-z]+\.[a-z_]+)=", text):
+        group, name = key.split(".")
+        assert name in {item.name for item in fields(GROUPS[group])}, key
+
+
+def test_settings_named_in_the_guides_exist():
+    known = {f"{group}.{item.name}" for group, form in GROUPS.items() for item in fields(form)}
+    for text in GUIDES.values():
+        named = set(re.findall(r"``((?:run|data|optimiser)\.[a-z_]+)", text))
+        assert named
+        assert named <= known
+
+
+def test_every_report_has_its_command():
+    named = set(re.findall(r"--report ([a-z-]+)", GUIDES["evaluation"]))
+    assert named == set(REPORTS)
+
+
+def test_every_event_of_the_log_is_explained():
+    folder = ROOT / "lsmgeo" / "models" / "training"
+    source = "".join((folder / name).read_text(encoding="utf-8") for name in ("loop.py", "logs.py"))
+    events = set(re.findall(r'\.event\(\s*"(\w+)"', source)) | set(re.findall(r'"(start|resume)"', source))
+    assert len(events) > 6
+    assert events <= set(re.findall(r"``(\w+)``", GUIDES["training"]))
+
+
+def test_every_fault_is_a_test_that_exists():
+    named = re.findall(r":fault:`(\w+\.py)::(\w+)`", GUIDES["training"])
+    assert len(named) > 8
+    for file, name in named:
+        tree = ast.parse((ROOT / "tests" / "models" / "training" / file).read_text(encoding="utf-8"))
+        assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}, name
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_pages_of_models_name_what_exists(page):
+    text = PAGES[page]
+    for block in re.findall(r"\.\. code-block:: python\n\n((?:   .*\n|\n)+)", text):
+        ast.parse(re.sub(r"(?m)^   ", "", block))
+    for name, preset, *variant in re.findall(r"\.\. model-layers:: ([\w-]+) (\w+)(?: (\w+))?", text):
+        assert create(name, preset=preset, variant=variant[0] or "paper").name == name
+    drawn = ast.parse((DOCS / "figures" / "networks.py").read_text(encoding="utf-8"))
+    functions = {node.name for node in drawn.body if isinstance(node, ast.FunctionDef)}
+    assert set(re.findall(r"figures/networks\.py (\w+)", text)) <= functions
+
+
+def test_the_front_page_of_models_runs_and_examples_are_configurations():
+    block = re.search(r"\.\. code-block:: python\n\n((?:   .*\n|\n)+)", PAGES["index"])
+    names: dict = {}
+    exec(re.sub(r"(?m)^   ", "", block[1]), names)
+    assert names["found"].occupancy.shape == (1, 16, 16, 16)
+    assert names["found"].by_view.shape == (1, 3, 16, 16, 16)
+    for name in re.findall(r"lsmgeo train (examples/\S+\.toml)", GUIDES["training"]):
+        read_config(ROOT / name)
+
+
+def test_a_curve_counts_the_time_that_a_run_takes(tmp_path):
+    """A run that was killed and resumed an hour later: the hour does not count, and a repeated step counts once."""
+
+    def line(event, time, **values):
+        return json.dumps({"event": event, "time": time, **values})
+
+    def evaluated(step, time, iou):
+        return line("evaluation", time, step=step, iou={"1": iou}, loss=0.5)
+
+    lines = [
+        line("start", 100.0, parameters=7, shapes=8, held_back=2),
+        evaluated(10, 160.0, 0.1),
+        evaluated(20, 220.0, 0.2),
+        line("resume", 3820.0),
+        evaluated(20, 3880.0, 0.3),
+    ]
+    (tmp_path / "log.jsonl").write_text("\n".join(lines) + "\n")
+    (tmp_path / "config.json").write_text(json.dumps({"data": {"source": "/somewhere/set64"}, "run": {}}))
+    row = {"name": "V-LSM", "values": [30.0], "standard_errors": [1.0], "other_data": False}
+    table = {"key": "views", "columns": ["1"], "rows": [row, {**row, "name": "paper", "other_data": True}]}
+    (tmp_path / "iou.json").write_text(json.dumps({"tables": [table], "facts": {"data": "26 shapes"}}))
+    kept = training_curve.keep(tmp_path, tmp_path / "iou.json")
+    assert [(found["step"], found["seconds"], found["iou"]["1"]) for found in kept["log"]] == [
+        (10, 60.0, 0.1),
+        (20, 180.0, 0.3),
+    ]
+    assert kept["settings"]["data"]["source"] == "set64"
+    assert kept["evaluation"]["iou"] == {"V-LSM": [30.0]}

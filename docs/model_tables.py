@@ -99,8 +99,8 @@ def curve_text(found: dict[str, Any]) -> str:
     return (
         f"{found['parameters']:,} parameters, {found['shapes']:,} shapes; {last['step']:,} steps of "
         f"{settings['run']['batch']} shapes with {settings['data']['views']} views in {last['seconds'] / 60:.0f} "
-        f"minutes, evaluations included, on {found['machine']['device']}; the curve is of {found['held_back']} shapes held "
-        f"back, the table of {found['evaluation']['data']}."
+        f"minutes, evaluations included, on {found['machine']['device']}; the curve is of {found['held_back']} shapes "
+        f"held back, the table of {found['evaluation']['data']}."
     )
 
 

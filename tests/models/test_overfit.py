@@ -32,7 +32,7 @@ def eight_objects(views: int) -> Batch:
 def test_voxels_of_eight_objects_are_learnt_by_heart():
     torch.manual_seed(0)
     model, batch = create("voxel-lsm", preset="tiny"), eight_objects(4)
-    learn(model, batch, 500, 1e-2)
+    learn(model, batch, 250, 1e-2)
     truth = batch.occupancy[:, None].expand(-1, 4, -1, -1, -1)
     found = voxel_iou(model.run(batch.images, batch.cameras).by_view, truth)
     print("IoU after 1 to 4 views", found.mean(0).tolist())
@@ -45,7 +45,7 @@ def test_voxels_of_eight_objects_are_learnt_by_heart():
 def test_depth_of_eight_objects_is_learnt_by_heart():
     torch.manual_seed(0)
     model, batch = create("depth-lsm", preset="tiny"), eight_objects(3)
-    learn(model, batch, 1000, 1e-2)
+    learn(model, batch, 800, 1e-2)
     errors = (model.run(batch.images, batch.cameras).depth - batch.depth).abs()
     found = torch.stack([error[mask].mean() for error, mask in zip(errors, batch.mask, strict=True)])
     print("mean absolute depth error of each object", found.tolist())

@@ -101,6 +101,8 @@ without_siblings = (
     "troubleshooting",
     "reconstruct",
     "metrics",
+    "training",
+    "evaluation",
 )
-html_sidebars = {page: [] for page in (*without_siblings, "formats/index")}
+html_sidebars = {page: [] for page in (*without_siblings, "formats/index", "models/*")}
 html_show_sourcelink = False

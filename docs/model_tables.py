@@ -22,19 +22,22 @@ GROUPS = configuration.GROUPS
 
 
 def layer_rows(name: str, preset: str, variant: str) -> list[list[str]]:
-    """Every stage of a model: what it reads and does, what it gives, its parameters."""
+    """Every stage of a model: what it does and reads, what it gives, its parameters."""
     stages = traced(name, preset, variant)
-    rows = [["stage", "what it does", "reads", "gives", "parameters"]]
+    rows = [["stage", "what it does", "reads, if not the one before", "gives", "parameters"]]
     for before, stage in zip((None, *stages), stages, strict=False):
         reads = [f"``{source}``" for source in stage.sources]
         if before is not None and stage.sources == [before.name]:
-            reads = ["the one before"]
+            reads = []
         rows.append([f"``{stage.name}``", stage.what, ", ".join(reads), shape_text(stage), number(stage.parameters)])
     total = sum(stage.parameters for stage in stages)
     return [*rows, ["**all**", "", "", "", number(total)]]
 
 
 def shape_text(stage: Stage) -> str:
+    channels, *size = stage.shape
+    if len(set(size)) == 1 and len(size) > 1:
+        return f"{channels} x {size[0]}\\ :sup:`{len(size)}`"
     return " x ".join(map(str, stage.shape))
 
 

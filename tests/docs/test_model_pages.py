@@ -23,7 +23,7 @@ GUIDES = {name: (DOCS / f"{name}.rst").read_text(encoding="utf-8") for name in (
 PAGES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((DOCS / "models").glob("*.rst"))}
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = {
-    "train": commands.train, "evaluate": commands.evaluate, "reconstruct": cli.reconstruct, "render": cli.render,
+    "train": commands.train, "evaluate": commands.evaluate, "reconstruct": commands.reconstruct, "render": cli.render,
     "convert": cli.convert,
 }  # fmt: skip
 

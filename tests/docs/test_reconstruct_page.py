@@ -5,13 +5,14 @@ import re
 import textwrap
 from pathlib import Path
 
-from lsmgeo import classical, cli
+from lsmgeo import classical
 from lsmgeo.metrics import depth_errors
+from lsmgeo.models import commands
 
 ROOT = Path(__file__).resolve().parents[2]
 GUIDE = (ROOT / "docs" / "reconstruct.rst").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-OPTIONS = inspect.signature(cli.reconstruct).parameters
+OPTIONS = inspect.signature(commands.reconstruct).parameters
 
 
 def default(function, name: str):

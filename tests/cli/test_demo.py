@@ -58,7 +58,7 @@ def test_questions_about_the_command_end_well(arguments, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], '"subcommand" to be one of {demo,info,reconstruct,convert,render}'),
+        ([], '"subcommand" to be one of {demo,info,reconstruct,convert,render, ...}'),
         (["dance"], "invalid choice: 'dance'"),
         (["--dance"], "unrecognized arguments: --dance"),
         (["demo", "--dance", "3"], "unrecognized arguments: --dance 3"),
@@ -67,7 +67,10 @@ def test_questions_about_the_command_end_well(arguments, capsys):
         (["reconstruct"], "required: .*scene"),
         (["reconstruct", ".", "more"], "unrecognized arguments: more"),
         (["reconstruct", ".", "--dens", "0.3"], "unrecognized arguments: --dens"),
-        (["reconstruct", ".", "--method", "guess"], "method must be one of 'sweep', 'hull'; got 'guess'"),
+        (
+            ["reconstruct", ".", "--method", "guess"],
+            "method must be one of 'sweep', 'hull', 'v-lsm', 'd-lsm'; got 'guess'",
+        ),
         (["reconstruct", ".", "--score", "mse"], "score must be one of 'zncc', 'sad', 'census'; got 'mse'"),
         (["reconstruct", ".", "--size", "1.5"], "size must be a whole number; got '1.5'"),
         (["reconstruct", ".", "--planes", "many"], "planes must be a whole number; got 'many'"),

@@ -12,14 +12,13 @@ from typing import Protocol
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from lsmgeo._checks import check_whole
 from lsmgeo.cameras import CameraTensors, resize, select, stack, to
 from lsmgeo.data import Batch, Sample, ShardSet, collate
 from lsmgeo.data.backgrounds import Background, make_background
 from lsmgeo.errors import OptionError
-from lsmgeo.models.training.adapting import resize_sample
+from lsmgeo.models.training.adapting import resize_images, resize_sample
 
 __all__ = [
     "Shapes",
@@ -352,8 +351,7 @@ def resized(images: Tensor, cameras: CameraTensors, size: int) -> tuple[Tensor, 
     """
     if tuple(images.shape[-2:]) == (size, size):
         return images, cameras
-    small = interpolate(images.flatten(0, 1), (size, size), mode="area")
-    return small.unflatten(0, images.shape[:2]), resize(cameras, size, size)
+    return resize_images(images.flatten(0, 1), size).unflatten(0, images.shape[:2]), resize(cameras, size, size)
 
 
 def first_views(cameras: CameraTensors, views: int) -> CameraTensors:

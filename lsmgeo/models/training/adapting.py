@@ -13,7 +13,7 @@ from lsmgeo import cameras as camera_tools
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.data import Sample
 
-__all__ = ["AdaptedShapes", "resize_sample", "turn_cameras"]
+__all__ = ["AdaptedShapes", "resize_images", "resize_sample", "turn_cameras"]
 
 # The last number of the seed that pose noise is drawn from, unlike any number of another draw.
 NOISE = 0x706F7365
@@ -70,13 +70,17 @@ def resize_sample(sample: Sample, size: int) -> Sample:
         share = _averaged(mask.float(), size)
         if depth is not None:
             depth = torch.where(share >= 0.5, _averaged(depth * mask, size) / share.clamp_min(1e-6), 0.0)
-    mode = "area" if size < sample.images.shape[-1] else "bilinear"
     return sample._replace(
-        images=torch.nn.functional.interpolate(sample.images, (size, size), mode=mode),
+        images=resize_images(sample.images, size),
         cameras=camera_tools.resize(sample.cameras, size, size),
         depth=depth,
         mask=None if sample.mask is None or share is None else share >= 0.5,
     )
+
+
+def resize_images(images: Tensor, size: int) -> Tensor:
+    """Square images (N, C, size, size) of others: smaller ones hold means of areas, larger ones are interpolated."""
+    return torch.nn.functional.interpolate(images, (size, size), mode="area" if size < images.shape[-1] else "bilinear")
 
 
 def _averaged(maps: Tensor, size: int) -> Tensor:

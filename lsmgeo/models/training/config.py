@@ -236,6 +236,12 @@ class TrainingConfig:
     run: RunConfig
 
     def __post_init__(self) -> None:
+        low, high = self.data.view_range
+        if self.run.loss_views == "random" and low != high:
+            raise OptionError(
+                "run: loss_views must be 'every' or 'last' where shapes have differently many views; "
+                f"got 'random' with data.views = {self.data.views!r}"
+            )
         if self.optimiser.schedule == "cosine" and self.run.steps is None:
             raise OptionError("run: steps must be given with optimiser.schedule = 'cosine', which ends there; got None")
 

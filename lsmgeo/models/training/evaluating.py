@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -44,8 +45,8 @@ class Evaluation:
         return self.by_view[max(self.by_view)]
 
     def is_better_than(self, value: float | None) -> bool:
-        """Whether the measure is better than a value; any is better than none."""
-        if value is None:
+        """Whether the measure is better than a value; any is better than none, and than NaN."""
+        if value is None or math.isnan(value):
             return True
         return self.value > value if self.measure == "iou" else self.value < value
 

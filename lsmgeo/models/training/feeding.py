@@ -9,6 +9,7 @@ import hashlib
 import json
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,7 +57,14 @@ class Shapes:
 
 
 def open_shapes(
-    config: DataConfig, need: Need, *, seed: int, device: torch.device, views: int | None = None, is_training: bool
+    config: DataConfig,
+    need: Need,
+    *,
+    seed: int,
+    device: torch.device,
+    views: int | None = None,
+    is_training: bool,
+    folder: Path | None = None,
 ) -> Shapes:
     """Open the part of a set that is trained on, or the part that is evaluated on.
 
@@ -68,6 +76,7 @@ def open_shapes(
         views: how many views of each shape; by default as the configuration says.
         is_training: training takes `split`, `categories` and pose noise; evaluation `validation_split` and
             `validation_categories`, never skips a shape, and turns no camera.
+        folder: of the run, where ``bad_samples.jsonl`` tells of shapes that were skipped; by default beside the shards.
 
     Raises:
         OptionError: the shards hold no shape of this kind, no depth or no voxels of this resolution.
@@ -107,6 +116,7 @@ def open_shapes(
         split=split,
         on_error=config.on_error if is_training else "raise",
         max_bad_fraction=config.max_bad_fraction,
+        bad_samples=None if folder is None else folder / "bad_samples.jsonl",
     )
     all_names = dataset.names  # type: ignore[attr-defined]
     limit = len(all_names) if config.limit is None else config.limit

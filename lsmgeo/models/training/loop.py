@@ -8,7 +8,7 @@ import os
 import time
 import warnings
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -116,10 +116,13 @@ def _train(
     run, data = config.run, config.data
     device, rank, processes = accelerator.device, accelerator.process_index, accelerator.num_processes
 
-    model = make_model(config.model, run, device)
+    checkpoint = load_latest(folder)
+    # A run that goes on has its weights.
+    beginning = config.model if checkpoint is None else replace(config.model, weights=None)
+    model = make_model(beginning, run, device)
     need = Need(model.image_size, model.resolution if model.output == "voxels" else None, model.output == "depth")
     most = data.view_range[1]
-    shapes = open_shapes(data, need, seed=run.seed, device=device, is_training=True)
+    shapes = open_shapes(data, need, seed=run.seed, device=device, is_training=True, folder=folder)
     held_back = open_shapes(
         data, need, seed=run.seed, device=device, is_training=False, views=run.evaluate_views or most
     )
@@ -128,7 +131,6 @@ def _train(
     place = Place()
 
     identity = {**config.to_dict(), "processes": processes, "shapes": shapes.identity}
-    checkpoint = load_latest(folder)
     if checkpoint is not None:
         check_config(checkpoint, identity, free=config.free())
         checkpoint.restore_model(model)
@@ -138,6 +140,10 @@ def _train(
             checkpoint.restore("scaler", accelerator.scaler)
         restore_random_state(checkpoint.part("random"))
         place = Place(**checkpoint.part("place"))
+        before = checkpoint.config["run"]
+        if any(before[key] != getattr(run, key) for key in ("evaluate_shapes", "evaluate_views")):
+            # What was measured on other shapes or views is no measure of what comes.
+            place.best = place.best_value = None
     check_agreement(
         {"the configuration": identity, "the step": place.step, "the parameters": parameter_checksum(model)}
     )
@@ -253,6 +259,8 @@ def _train(
                     ended = "stop"
                 else:
                     evaluation, place.evaluated = found, place.step
+                    # Whatever was saved of this step does not know of it.
+                    saved_step = None
                     if found.is_better_than(place.best_value):
                         place.best, place.best_value = place.step, found.value
                     log.evaluation(place.step, found, seconds=time.monotonic() - begun, best=place.best)

@@ -78,9 +78,8 @@ def find_gradients(
     for index, batch in enumerate(batches):
         is_last = index == len(batches) - 1
         with contextlib.nullcontext() if is_last else accelerator.no_sync(wrapped):
-            asked = [min(steps[0], batch.view_mask.shape[1] - 1)] if isinstance(steps, list) else steps
-            output = wrapped(batch.images, batch.cameras, batch.view_mask, steps=asked)
-            part, number = sum_loss(output, batch, region=region, steps=asked)
+            output = wrapped(batch.images, batch.cameras, batch.view_mask, steps=steps)
+            part, number = sum_loss(output, batch, region=region, steps=steps)
             accelerator.backward(part / terms)
         sums += torch.stack((part.detach(), number))
     if accelerator.num_processes > 1:

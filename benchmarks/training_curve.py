@@ -48,7 +48,8 @@ def keep(run: Path, report: Path) -> dict[str, Any]:
     rows = {row["name"]: row["values"] for row in table["rows"] if not row["other_data"]}
     errors = {row["name"]: row["standard_errors"] for row in table["rows"] if not row["other_data"]}
     settings = json.loads((run / "config.json").read_text(encoding="utf-8"))
-    settings["data"]["source"] = Path(settings["data"]["source"]).name  # where it lies says nothing elsewhere
+    source = settings["data"]["source"]
+    settings["data"]["source"] = Path(source).name  # where it lies says nothing elsewhere
     return {
         "settings": settings,
         "machine": timing.machine("cpu"),
@@ -57,7 +58,7 @@ def keep(run: Path, report: Path) -> dict[str, Any]:
         "held_back": start["held_back"],
         "log": log,
         "evaluation": {
-            "data": found["facts"]["data"],
+            "data": found["facts"]["data"].replace(source, Path(source).name),
             "views": [int(view) for view in table["columns"]],
             "iou": rows,
             "standard_errors": errors,

@@ -34,6 +34,12 @@ TABLES: dict[str, Callable[[list[dict[str, Any]]], report.Rows]] = {
 }
 # Figures of the plot directive, and the results that they draw.
 PLOTS = {"benchmark_growth": "growth", "classical_density": "classical", "training_curve": "vlsm_compact"}
+# What the drawings and tables of the models are made from.
+SOURCES = [
+    *sorted((ROOT / "lsmgeo" / "models").glob("*.py")),
+    ROOT / "lsmgeo" / "models" / "training" / "config.py",
+    *(ROOT / "docs" / name for name in ("model_tables.py", "network_tracing.py")),
+]
 
 
 def load(name: str) -> dict[str, Any] | None:
@@ -71,11 +77,12 @@ class Benchmark(SphinxDirective):
 
 
 def forget_plots(app: Sphinx) -> None:
-    """Remove plots that are older than their results: the plot directive looks at the age of the script alone."""
-    for name, drawn in PLOTS.items():
-        results = RESULTS / f"{drawn}.json"
+    """Remove plots that are older than what they show: the plot directive looks at the age of the script alone."""
+    shown = {name: [RESULTS / f"{drawn}.json"] for name, drawn in PLOTS.items()} | {"networks": SOURCES}
+    for name, files in shown.items():
+        newest = max((file.stat().st_mtime for file in files if file.is_file()), default=0.0)
         for plot in (Path(app.doctreedir).parent / "plot_directive").rglob(f"{name}*"):
-            if results.is_file() and plot.stat().st_mtime < results.stat().st_mtime:
+            if plot.stat().st_mtime < newest:
                 plot.unlink()
 
 

@@ -7,7 +7,7 @@ import re
 from dataclasses import MISSING, fields
 from typing import Any
 
-from benchmark_tables import RESULTS, list_table, load
+from benchmark_tables import RESULTS, SOURCES, list_table, load
 from docutils import nodes
 from docutils.statemachine import StringList
 from network_tracing import Stage, traced
@@ -116,6 +116,8 @@ class Rows(SphinxDirective):
         raise NotImplementedError
 
     def run(self) -> list[nodes.Node]:
+        for source in SOURCES:
+            self.env.note_dependency(str(source))
         lines = [line.replace("   :class: benchmark", "   :class: layers") for line in list_table(self.rows())]
         return self.parse_text_to_nodes(StringList(lines, source=str(self.name)))
 

@@ -165,11 +165,14 @@ def test_a_curve_counts_the_time_that_a_run_takes(tmp_path):
     (tmp_path / "config.json").write_text(json.dumps({"data": {"source": "/somewhere/set64"}, "run": {}}))
     row = {"name": "V-LSM", "values": [30.0], "standard_errors": [1.0], "other_data": False}
     table = {"key": "views", "columns": ["1"], "rows": [row, {**row, "name": "paper", "other_data": True}]}
-    (tmp_path / "iou.json").write_text(json.dumps({"tables": [table], "facts": {"data": "26 shapes"}}))
+    (tmp_path / "iou.json").write_text(
+        json.dumps({"tables": [table], "facts": {"data": "26 shapes of /somewhere/set64"}})
+    )
     kept = training_curve.keep(tmp_path, tmp_path / "iou.json")
     assert [(found["step"], found["seconds"], found["iou"]["1"]) for found in kept["log"]] == [
         (10, 60.0, 0.1),
         (20, 180.0, 0.3),
     ]
     assert kept["settings"]["data"]["source"] == "set64"
+    assert kept["evaluation"]["data"] == "26 shapes of set64"
     assert kept["evaluation"]["iou"] == {"V-LSM": [30.0]}

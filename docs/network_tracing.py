@@ -191,6 +191,9 @@ def describe(module: nn.Module) -> str:
         "_GridBlock": "doubled, two 3x3x3 convolutions, shortcut",
         "_LastBlock": "four 3x3x3 convolutions, shortcut; two classes, as one logit",
     }[type(module).__name__]
+    if type(module).__name__ == "_ImageBlock":
+        has_shortcut = module.is_residual or module.shortcut is not None
+        words = words if has_shortcut else words.replace(" shortcut,", "")
     if type(module).__name__ == "Unproject" and "direction" not in str(module.augment):
         words = "features into the grid, with depth"
     if getattr(module, "is_release", False):

@@ -23,6 +23,6 @@ else:
     names = [name for name in HULLS if name in measured["iou"]]
     for name in names:
         axes.plot([], [], color="0.4", linestyle=HULLS[name], label=f"{name}, 1 to 4 views")
-    axes.legend(fontsize=8, frameon=False, ncols=2, loc="lower right")
-    axes.set(xlim=(0, None), ylim=(0, 100))
+    axes.legend(fontsize=8, frameon=False, ncols=3, loc="upper left")
+    axes.set(xlim=(0, None), ylim=(0, 80))
 axes.set(xlabel="minutes of training", ylabel="voxel IoU of shapes held back, %")

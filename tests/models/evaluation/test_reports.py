@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from lsmgeo.cameras import orbit, rays
 from lsmgeo.errors import OptionError
 from lsmgeo.models.evaluation import Contender, Options, Training, evaluate, write_report
 from lsmgeo.models.evaluation.plane_sweeps import Swept, sweep_views
@@ -77,6 +78,37 @@ def test_the_hull_of_full_silhouettes_is_all_that_is_seen():
     for name in ("visual hull", "visual hull, strict"):
         # The object's pixel that is missing in the corner hides no more than a few voxels of 512.
         np.testing.assert_allclose(values(report, "views", name), mean_of([w / 8 for w in WIDTHS]), rtol=0.1)
+
+
+class HalfSilhouettes(FakeShapes):
+    """View 1 shows the half y > 0 of the cube, from the axis z, view 2 the half z < 0, from x, and the others all."""
+
+    def read(self, index, views, **options):
+        sample = super().read(index, views, **options)
+        mask = torch.ones(views, SIZE, SIZE, dtype=torch.bool)
+        mask[0, SIZE // 2 :] = False
+        mask[1:2, :, : SIZE // 2] = False
+        azimuths = torch.tensor([90.0, 0.0, 180.0, 270.0, 90.0])[:views]
+        # Every voxel's centre is in the pictures, and more than half a pixel off the edges of the silhouettes.
+        cameras = orbit(azimuths, 0.0, 2.0, focal_length=1.5 * SIZE, height=SIZE, width=SIZE)
+        return sample._replace(mask=mask, cameras=cameras)
+
+
+def test_the_hull_after_a_view_is_of_the_views_so_far():
+    """Slabs of 4 and of 2 planes, 256 and 128 of 512 voxels, against a half, a quarter and three quarters of them."""
+    shapes = HalfSilhouettes((4, 2), ("chair", "lamp"))
+    report = evaluate([Contender("fake", FakeVoxels(by_count))], shapes, "iou", Options(views=5))
+    scores = np.array(
+        [[shape["iou"][name] for name in ("visual hull", "visual hull, strict")] for shape in report.shapes]
+    )
+    # After one view y > 0: half of either slab is among its 256 voxels.
+    np.testing.assert_allclose(scores[..., 0].T, [[128 / 384, 64 / 320]] * 2, rtol=1e-12)
+    # After two y > 0 and z < 0: 128 voxels, that is half of the thick slab, and half of the thin one is in them.
+    np.testing.assert_allclose(scores[..., 1].T, [[128 / 256, 64 / 192]] * 2, rtol=1e-12)
+    # After five, four views of five are enough for the paper's rule: y > 0 or z < 0, 384 voxels with both slabs.
+    np.testing.assert_allclose(scores[..., 4].T, [[256 / 384, 128 / 384], [128 / 256, 64 / 192]], rtol=1e-12)
+    for name, of_rule in zip(("visual hull", "visual hull, strict"), scores.mean(0), strict=True):
+        np.testing.assert_allclose(values(report, "views", name), 100 * of_rule, rtol=1e-12)
 
 
 @pytest.mark.parametrize("report", ["iou", "order", "pose-noise"])
@@ -193,8 +225,6 @@ def test_depth_counts_the_pixels_that_plane_sweep_has(monkeypatch):
 
 def test_plane_sweep_finds_a_plane():
     """A wall that faces the first camera, seen by three: its pattern is a function of the place on it."""
-    from lsmgeo.cameras import orbit, rays
-
     cameras = orbit(torch.tensor([0.0, 6.0, -6.0]), 0.0, 2.0, focal_length=60.0, height=32, width=32)
     origins, directions = rays(cameras)
     reach = (0.2 - origins[:, None, None, 0]) / directions[..., 0]  # the wall is at x = 0.2

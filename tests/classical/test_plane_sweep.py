@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import warnings
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -247,7 +246,7 @@ def _status(key: str) -> int:
 
 
 def _measure(connection: Any, size: tuple[int, int]) -> None:
-    torch.set_num_threads(1)  # of a forked process
+    torch.set_num_threads(2)
     memory = least_memory(size)
     pictures = analytic.render("slanted", size=size)
     swept(pictures, 10, memory=memory)  # what libraries take once
@@ -260,12 +259,10 @@ def _measure(connection: Any, size: tuple[int, int]) -> None:
 @pytest.mark.skipif(not os.access("/proc/self/clear_refs", os.W_OK), reason="this system tells no peak")
 def test_a_sweep_stays_within_its_memory():
     size = (160, 200)
-    context = multiprocessing.get_context("fork")
+    context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_measure, args=(sender, size))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of forking beside threads, which the child has none of
-        process.start()
+    process.start()
     sender.close()
     added, bound = receiver.recv()
     process.join()

@@ -94,7 +94,8 @@ def test_the_kernel_alone_computes_what_the_public_call_does(name):
 @pytest.mark.skipif(not memory.can_measure(), reason="this system tells no peak memory")
 @pytest.mark.parametrize("count", [20_000_000, 100_000_000])
 def test_a_known_allocation_is_measured(count):
-    assert memory.known(count) == pytest.approx(count, rel=0.05)
+    # What else the process holds by then comes and goes by a megabyte or two.
+    assert memory.known(count) == pytest.approx(count, rel=0.05, abs=3e6)
 
 
 def test_a_run_becomes_tables(tmp_path):

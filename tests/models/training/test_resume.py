@@ -111,6 +111,8 @@ def test_the_same_seed_gives_the_same_run(shards, whole, tmp_path):
     assert losses(tmp_path) == losses(whole)
 
 
+# Four on a machine of two cores are told to be many, and do as they should.
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
 @pytest.mark.parametrize("workers", [1, pytest.param(4, marks=pytest.mark.long)])
 def test_the_number_of_workers_changes_nothing(shards, whole, tmp_path, workers):
     run(configure(shards, workers=workers), tmp_path)

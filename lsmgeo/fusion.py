@@ -66,6 +66,12 @@ class Max(_Statistic):
     name = "max"
 
 
+def _odd(who: str, name: str, value: int) -> int:
+    if check_whole(who, name, value, 1) % 2 == 0:
+        raise OptionError(f"{who}: {name} must be odd; got {value}")
+    return value
+
+
 class _Recurrent(nn.Module):
     """What the recurrent fusions share: the loop over views, and parts that hold the weights of one step.
 
@@ -76,32 +82,45 @@ class _Recurrent(nn.Module):
     parts: int  # what a step computes from its input: gates and candidate
 
     def __init__(
-        self, in_channels: int, hidden_channels: int, *, kernel_size: int = 3, norm: bool = True, eps: float = 1e-5
+        self,
+        in_channels: int,
+        hidden_channels: int,
+        kernel_size: int,
+        state_kernel_size: int | None,
+        *,
+        norm: bool,
+        eps: float,
     ) -> None:
         super().__init__()
         who = type(self).__name__
         self.in_channels = check_whole(who, "in_channels", in_channels, 1)
         self.hidden_channels = check_whole(who, "hidden_channels", hidden_channels, 1)
-        self.kernel_size = check_whole(who, "kernel_size", kernel_size, 1)
-        if self.kernel_size % 2 == 0:
-            raise OptionError(f"{who}: kernel_size must be odd; got {kernel_size}")
+        self.kernel_size = _odd(who, "kernel_size", kernel_size)
+        self.state_kernel_size = _odd(
+            who, "state_kernel_size", kernel_size if state_kernel_size is None else state_kernel_size
+        )
         self.norm = check_flag(who, "norm", norm)
         self.eps = check_number(who, "eps", eps, "a small number")
         # A norm takes a bias out again.
-        self.input = self._convolution(self.in_channels, self.parts, bias=not norm)
-
-    def _convolution(self, channels: int, parts: int, *, bias: bool = False) -> nn.Conv3d:
-        return nn.Conv3d(
-            channels, parts * self.hidden_channels, self.kernel_size, padding=self.kernel_size // 2, bias=bias
+        self.input = nn.Conv3d(
+            self.in_channels,
+            self.parts * self.hidden_channels,
+            self.kernel_size,
+            padding=self.kernel_size // 2,
+            bias=not norm,
         )
+
+    def _of_state(self, parts: int) -> nn.Conv3d:
+        size, channels = self.state_kernel_size, self.hidden_channels
+        return nn.Conv3d(channels, parts * channels, size, padding=size // 2, bias=False)
 
     def _layer_norm(self) -> nn.Module:
         return nn.GroupNorm(1, self.hidden_channels, self.eps) if self.norm else nn.Identity()
 
     def _initialise(self) -> None:
         """Xavier-uniform weights, as of one convolution over [input, state]."""
-        fans = self.in_channels + 2 * self.hidden_channels
-        bound = (6.0 / (fans * self.kernel_size**3)) ** 0.5
+        fans = self.in_channels * self.kernel_size**3 + 2 * self.hidden_channels * self.state_kernel_size**3
+        bound = (6.0 / fans) ** 0.5
         for module in self.modules():
             if isinstance(module, nn.Conv3d):
                 nn.init.uniform_(module.weight, -bound, bound)
@@ -162,8 +181,8 @@ class _Recurrent(nn.Module):
     def extra_repr(self) -> str:
         """The arguments."""
         return (
-            f"{self.in_channels}, {self.hidden_channels}, kernel_size={self.kernel_size}, norm={self.norm}, "
-            f"eps={self.eps:g}"
+            f"{self.in_channels}, {self.hidden_channels}, kernel_size={self.kernel_size}, "
+            f"state_kernel_size={self.state_kernel_size}, norm={self.norm}, eps={self.eps:g}"
         )
 
 
@@ -178,7 +197,8 @@ class ConvGRU3d(_Recurrent):
     Args:
         in_channels: C of the volumes.
         hidden_channels: C' of the state.
-        kernel_size: odd.
+        kernel_size: of the convolutions over a view's volume, odd.
+        state_kernel_size: of those over the state, odd; by default `kernel_size`.
         norm: whether to normalise; without, the convolutions over x have a bias.
         eps: of the normalisation.
 
@@ -201,11 +221,18 @@ class ConvGRU3d(_Recurrent):
     parts = 3
 
     def __init__(
-        self, in_channels: int, hidden_channels: int, *, kernel_size: int = 3, norm: bool = True, eps: float = 1e-5
+        self,
+        in_channels: int,
+        hidden_channels: int,
+        *,
+        kernel_size: int = 3,
+        state_kernel_size: int | None = None,
+        norm: bool = True,
+        eps: float = 1e-5,
     ) -> None:
-        super().__init__(in_channels, hidden_channels, kernel_size=kernel_size, norm=norm, eps=eps)
-        self.state_gates = self._convolution(hidden_channels, 2)
-        self.state_candidate = self._convolution(hidden_channels, 1)
+        super().__init__(in_channels, hidden_channels, kernel_size, state_kernel_size, norm=norm, eps=eps)
+        self.state_gates = self._of_state(2)
+        self.state_candidate = self._of_state(1)
         self.reset_norm = self._layer_norm()
         self.update_norm = self._layer_norm()
         self.candidate_norm = self._layer_norm()
@@ -235,7 +262,8 @@ class ConvLSTM3d(_Recurrent):
     Args:
         in_channels: C of the volumes.
         hidden_channels: C' of the output.
-        kernel_size: odd.
+        kernel_size: of the convolutions over a view's volume, odd.
+        state_kernel_size: of those over the state, odd; by default `kernel_size`.
         norm: whether to normalise; without, the convolution over x has a bias.
         eps: of the normalisation.
 
@@ -258,10 +286,17 @@ class ConvLSTM3d(_Recurrent):
     parts = 4
 
     def __init__(
-        self, in_channels: int, hidden_channels: int, *, kernel_size: int = 3, norm: bool = True, eps: float = 1e-5
+        self,
+        in_channels: int,
+        hidden_channels: int,
+        *,
+        kernel_size: int = 3,
+        state_kernel_size: int | None = None,
+        norm: bool = True,
+        eps: float = 1e-5,
     ) -> None:
-        super().__init__(in_channels, hidden_channels, kernel_size=kernel_size, norm=norm, eps=eps)
-        self.state_parts = self._convolution(hidden_channels, self.parts)
+        super().__init__(in_channels, hidden_channels, kernel_size, state_kernel_size, norm=norm, eps=eps)
+        self.state_parts = self._of_state(self.parts)
         self.norms = nn.ModuleList(self._layer_norm() for _ in range(self.parts))
         self.memory_norm = self._layer_norm()
         self._initialise()

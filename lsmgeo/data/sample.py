@@ -73,6 +73,20 @@ class Batch(NamedTuple):
     name: tuple[str, ...]
     view_mask: Tensor
 
+    def first_views(self, views: int) -> Batch:
+        """The same shapes with their first views only.
+
+        Args:
+            views: how many, at least 1.
+        """
+        return self._replace(
+            images=self.images[:, :views],
+            cameras=CameraTensors(*(torch.as_tensor(field)[:, :views] for field in self.cameras)),
+            depth=None if self.depth is None else self.depth[:, :views],
+            mask=None if self.mask is None else self.mask[:, :views],
+            view_mask=self.view_mask[:, :views],
+        )
+
 
 def check_sample(sample: Sample, who: str = "sample") -> CameraTensors:
     """Check the types, shapes and dtypes of a sample's fields, and that cameras and images are of one size.

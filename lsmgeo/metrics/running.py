@@ -112,6 +112,8 @@ class Running:
 class VoxelIoU:
     """Voxel IoU of a set: per category, and the mean of the categories. See `voxel_iou`, `category_means`, `Running`.
 
+    Models whose truth has no voxel count nowhere.
+
     Args:
         threshold: of the probabilities.
 
@@ -139,7 +141,7 @@ class VoxelIoU:
             categories: B names, or one for all.
         """
         _check_rank("VoxelIoU.update", "predicted", predicted, 4, "(B, D, H, W)")
-        values = voxel_iou(predicted, occupancy, threshold=self.threshold)
+        values = voxel_iou(predicted, occupancy, threshold=self.threshold, skip_empty=True)
         _collect("VoxelIoU.update", self._collected, values, categories)
 
     def merge(self, other: VoxelIoU) -> None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import FLOATS, check_devices, check_float, check_mask, check_number
+from lsmgeo._checks import FLOATS, check_devices, check_flag, check_float, check_mask, check_number
 from lsmgeo.errors import ShapeError
 
 __all__ = ["voxel_iou"]
 
 
 @torch.no_grad()
-def voxel_iou(predicted: Tensor, occupancy: Tensor, *, threshold: float = 0.4) -> Tensor:
+def voxel_iou(predicted: Tensor, occupancy: Tensor, *, threshold: float = 0.4, skip_empty: bool = False) -> Tensor:
     """Measure how much of two solids' union they share.
 
     Equation: ``|P and T| / |P or T|`` over the voxels of a grid, with P the voxels whose probability is above the
@@ -22,14 +22,16 @@ def voxel_iou(predicted: Tensor, occupancy: Tensor, *, threshold: float = 0.4) -
         predicted: (..., D, H, W) probabilities of any floating dtype, NaN counts as empty; or bool, taken as it is.
         occupancy: bool, of the same shape: the truth.
         threshold: of the probabilities.
+        skip_empty: whether grids whose truth has no voxel are NaN, so that means leave them out: a thin shape may have
+            none at a coarse resolution, and says nothing about a method.
 
     Returns:
-        (...) float64 in [0, 1], one a grid. Nothing is differentiable.
+        (...) float64 in [0, 1], or NaN, one a grid. Nothing is differentiable.
 
     Raises:
         ShapeError: the shapes differ, or there are fewer than three axes.
         DTypeError: ``occupancy`` is not bool.
-        OptionError: ``threshold`` is no number.
+        OptionError: ``threshold`` is no number, or ``skip_empty`` neither True nor False.
 
     Example:
         >>> import torch
@@ -52,4 +54,7 @@ def voxel_iou(predicted: Tensor, occupancy: Tensor, *, threshold: float = 0.4) -
     solid = predicted if predicted.dtype == torch.bool else predicted > level
     shared = (solid & occupancy).sum((-3, -2, -1)).double()
     union = (solid | occupancy).sum((-3, -2, -1)).double()
-    return torch.where(union > 0, shared / union.clamp_min(1), 1.0)
+    iou = torch.where(union > 0, shared / union.clamp_min(1), 1.0)
+    if check_flag(who, "skip_empty", skip_empty):
+        iou = torch.where(occupancy.flatten(-3).any(-1), iou, torch.nan)
+    return iou

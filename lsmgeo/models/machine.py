@@ -42,15 +42,18 @@ class Machine(Model):
         self.grid = VoxelGrid(settings.grid_size)
         self.image_encoder = ImageEncoder(settings)
         # "zeros": what lies outside an image is told apart from what looks like its border; the release smears that.
+        padding_mode = "border" if is_release else "zeros"
         self.unproject = Unproject(
-            self.grid,
-            padding_mode="border" if is_release else "zeros",
-            augment="depth" if is_release else ("depth", "direction"),
+            self.grid, padding_mode=padding_mode, augment="depth" if is_release else ("depth", "direction")
         )
+        self.lift = settings.lift
+        self.unproject_finely = Unproject(VoxelGrid(settings.grid_size * settings.lift), padding_mode=padding_mode)
         recurrence = ConvGRU3d if settings.fusion == "gru" else ConvLSTM3d
         self.fusion = recurrence(
-            settings.feature_channels + (1 if is_release else 4),
+            settings.feature_channels * settings.lift**3 + (1 if is_release else 4),
             settings.hidden_channels,
+            kernel_size=settings.input_kernel,
+            state_kernel_size=settings.state_kernel,
             eps=1e-12 if is_release else 1e-5,
         )
         self.grid_network = GridUNet(settings)
@@ -68,10 +71,20 @@ class Machine(Model):
             images = torch.where(view_mask[:, :, None, None, None], images, 0.0)
         views = tuple(images.shape[:2])
         features, maps = self.image_encoder(images.flatten(0, 1))
-        volume, visible = self.unproject(features.unflatten(0, views), cameras, view_mask)
-        states = self.fusion.states(volume, visible, view_mask)[:, after]
+        volume = self._unproject(features.unflatten(0, views), cameras, view_mask)
+        states = self.fusion.states(volume, view_mask=view_mask)[:, after]
         grids = self.grid_network(states.flatten(0, 1)).unflatten(0, states.shape[:2])
         return Seen(grids, tuple(item.unflatten(0, views) for item in maps))
+
+    def _unproject(self, features: Tensor, cameras: Cameras, view_mask: Tensor | None) -> Tensor:
+        """The volume (B, V, C, D, H, W) of every view: its samples, sub-voxel by sub-voxel, depth and direction."""
+        if self.lift == 1:
+            return self.unproject(features, cameras, view_mask).volume
+        samples = self.unproject_finely(features, cameras, view_mask).volume
+        cells = samples.unflatten(5, (-1, self.lift)).unflatten(4, (-1, self.lift)).unflatten(3, (-1, self.lift))
+        folded = cells.permute(0, 1, 2, 4, 6, 8, 3, 5, 7).flatten(2, 5)  # (B, V, C * lift^3, D, H, W)
+        geometry = self.unproject(features[:, :, :0], cameras, view_mask).volume
+        return torch.cat((folded, geometry), 2)
 
     def _check(self, images: Tensor, view_mask: Tensor | None) -> int:
         """Check images and mask; the number of views."""

@@ -21,6 +21,7 @@ class Model(nn.Module):
         image_size: side in pixels of the square images that it is meant for.
         resolution: voxels along a side of its finest grid.
         grid: that grid.
+        prefers_channels_last: whether it trains faster on CPUs with maps kept pixel by pixel in memory.
     """
 
     name: str
@@ -29,3 +30,4 @@ class Model(nn.Module):
     image_size: int
     resolution: int
     grid: VoxelGrid
+    prefers_channels_last = False

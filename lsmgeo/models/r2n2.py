@@ -208,6 +208,7 @@ class R2N2(Model):
     """
 
     output = "voxels"
+    prefers_channels_last = True
 
     def __init__(self, settings: R2N2Settings = PAPER, **changes: Any) -> None:
         super().__init__()

@@ -27,7 +27,11 @@ class MachineSettings:
         encoder_channels: of the image encoder's levels, each of half the size of the one before.
         feature_channels: of the features that are unprojected.
         feature_stride: pixels of the image to a pixel of the features, a power of 2.
+        lift: samples of the features along a side of a voxel, whose values become channels of that voxel: a cheap way
+            to detail finer than the grid on which views are fused. Depth and direction are appended once a voxel.
         fusion: "gru" or "lstm".
+        input_kernel: side in voxels of the recurrence's kernels over a view's features.
+        state_kernel: of those over its state.
         hidden_channels: of the recurrence's state.
         grid_channels: of the grid network's levels; 64^3 grids take a fourth of 256.
         output_channels: of the grid network's last layer.
@@ -41,7 +45,10 @@ class MachineSettings:
     encoder_channels: tuple[int, ...] = (32, 64, 128, 256)
     feature_channels: int = 32
     feature_stride: int = 2
+    lift: int = 1
     fusion: str = "gru"
+    input_kernel: int = 3
+    state_kernel: int = 3
     hidden_channels: int = 32
     grid_channels: tuple[int, ...] = (32, 64, 128)
     output_channels: int = 32
@@ -59,6 +66,10 @@ class MachineSettings:
         for name in ("feature_channels", "hidden_channels", "output_channels"):
             check_whole(who, name, getattr(self, name), 1, LARGEST_SIDE)
         check_flag(who, "grid_skip", self.grid_skip)
+        check_whole(who, "lift", self.lift, 1, 4)
+        for name in ("input_kernel", "state_kernel"):
+            if check_whole(who, name, getattr(self, name), 1, 15) % 2 == 0:
+                raise OptionError(f"{who}: {name} must be odd; got {getattr(self, name)}")
         for name in ("encoder_channels", "grid_channels"):
             check_channels(who, name, getattr(self, name))
         check_whole(who, "image_size", self.image_size, 1, LARGEST_SIDE)

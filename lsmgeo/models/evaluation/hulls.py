@@ -8,7 +8,7 @@ from torch import Tensor
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.classical import visual_hull
 from lsmgeo.grids import VoxelGrid
-from lsmgeo.metrics import voxel_iou
+from lsmgeo.models.evaluation.scores import iou_by_view
 from lsmgeo.models.evaluation.shapes import first_views
 
 __all__ = ["HULL", "STRICT_HULL", "hull_iou"]
@@ -26,8 +26,8 @@ def hull_iou(masks: Tensor, cameras: CameraTensors, occupancy: Tensor, *, rule: 
         rule: "mean" above 0.75, as in the paper, or "all": strictly within all silhouettes.
     """
     grid = VoxelGrid(tuple(occupancy.shape[1:]))  # type: ignore[arg-type]
-    found = [
-        voxel_iou(visual_hull(masks[:, :views], first_views(cameras, views), grid, rule=rule).occupancy, occupancy)
+    hulls = [
+        visual_hull(masks[:, :views], first_views(cameras, views), grid, rule=rule).occupancy
         for views in range(1, masks.shape[1] + 1)
     ]
-    return torch.stack(found, 1)
+    return iou_by_view(torch.stack(hulls, 1), occupancy)

@@ -109,9 +109,9 @@ def standard_error(values: Sequence[float], categories: Sequence[str]) -> float:
     return math.sqrt(total) / len(groups)
 
 
-def iou_by_view(predicted: Tensor, occupancy: Tensor, threshold: float) -> Tensor:
-    """IoU (B, V) of what is predicted after every view (B, V, D, H, W) with the truth (B, D, H, W)."""
-    return voxel_iou(predicted, occupancy[:, None].expand(predicted.shape), threshold=threshold)
+def iou_by_view(predicted: Tensor, occupancy: Tensor, threshold: float = 0.4) -> Tensor:
+    """IoU (B, V) of what is predicted after every view (B, V, D, H, W) with the truth (B, D, H, W), NaN if empty."""
+    return voxel_iou(predicted, occupancy[:, None].expand(predicted.shape), threshold=threshold, skip_empty=True)
 
 
 def joined(scores: Mapping[str, Scores], key: str) -> list[dict[str, Any]]:

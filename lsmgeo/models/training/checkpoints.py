@@ -113,6 +113,7 @@ def save_checkpoint(
     config: Mapping[str, Any],
     keep: int = 3,
     best: int | None = None,
+    about: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write a checkpoint, wholly or not at all, then remove the oldest ones. One process of a run does this.
 
@@ -124,6 +125,7 @@ def save_checkpoint(
         config: the configuration, in types that JSON has; `check_config` compares with it.
         keep: how many of the newest checkpoints stay.
         best: the step of the best checkpoint so far, which stays too.
+        about: further notes to keep with the weights, in types that JSON has.
 
     Returns:
         The checkpoint's folder.
@@ -136,7 +138,7 @@ def save_checkpoint(
     folder = Path(folder)
     step, keep = check_whole("save_checkpoint", "step", step, 0), check_whole("save_checkpoint", "keep", keep, 1)
     final = folder / step_folder(step)
-    about = {"step": step, "training": json.loads(_canonical(config))}
+    about = {"step": step, "training": json.loads(_canonical(config)), **(about or {})}
     files = {WEIGHTS: encode_weights(model, about=about), STATE: _encode_state(state)}
     files[META] = _encode_meta(files, step, config, best)
     try:

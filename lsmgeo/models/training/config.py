@@ -15,6 +15,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 from lsmgeo._checks import check_choice, check_flag, check_number, check_whole, describe
 from lsmgeo.data.files import read_text
 from lsmgeo.errors import DataError, OptionError
+from lsmgeo.models.losses import LOSSES
 
 __all__ = ["DataConfig", "ModelConfig", "OptimiserConfig", "RunConfig", "TrainingConfig", "make_config", "read_config"]
 
@@ -141,12 +142,18 @@ class RunConfig:
     Attributes:
         steps: the run ends after so many steps; None for no such end.
         minutes: or after so many minutes of training, over all resumes; None for no such end.
+        cpu_minutes: or after so many minutes of the process's CPU time, its evaluations included. The first 30 steps
+            are timed, and the number of steps is computed once: it is `steps` from then on, in ``config.json`` and
+            whenever the run is resumed, so that a schedule counts steps. A cosine begins after these 30. What reading
+            workers take is not counted.
         seed: of the weights, of the order of the shapes and of their views.
         batch: shapes that a process takes at once.
         accumulation: batches whose gradients make one step: a step takes batch x accumulation x processes shapes.
         device: "auto" takes a GPU where there is one; "cpu".
-        precision: "no", "bf16" or "fp16": what is computed in fewer bits (weights stay float32).
-        channels_last: whether feature maps are kept pixel by pixel in memory.
+        precision: "no", "bf16" or "fp16": what is computed in fewer bits (weights stay float32). "auto" is bf16
+            where the hardware multiplies it faster (GPUs that know it, CPUs with AMX), decided once for the run.
+        channels_last: whether feature maps are kept pixel by pixel in memory; None where it is faster for the network.
+        loss: of voxels: "bce", the paper's cross-entropy, or "bce+iou", see `lsmgeo.models.compute_loss`.
         loss_views: the loss is taken after "every" view, after a "random" one, or after the "last" alone.
         region: of depth, the pixels of the loss: the "object", or "all" with the background far away.
         evaluate_every: steps between evaluations; the end is always evaluated.
@@ -163,12 +170,14 @@ class RunConfig:
 
     steps: int | None = None
     minutes: float | None = None
+    cpu_minutes: float | None = None
     seed: int = 0
     batch: int = 4
     accumulation: int = 1
     device: str = "auto"
     precision: str = "no"
-    channels_last: bool = False
+    channels_last: bool | None = None
+    loss: str = "bce"
     loss_views: str = "every"
     region: str = "object"
     evaluate_every: int = 500
@@ -190,19 +199,23 @@ class RunConfig:
                 check_whole("run", item.name, value, least.get(item.name, 1))
         for name, choices in (
             ("device", ("auto", "cpu")),
-            ("precision", ("no", "bf16", "fp16")),
+            ("precision", ("auto", "no", "bf16", "fp16")),
+            ("loss", LOSSES),
             ("loss_views", ("every", "random", "last")),
             ("region", ("object", "all")),
         ):
             check_choice("run", name, getattr(self, name), choices)
-        for name in ("channels_last", "tensorboard"):
-            check_flag("run", name, getattr(self, name))
-        if self.minutes is not None and not check_number("run", "minutes", self.minutes, "a positive number") > 0:
-            raise OptionError(f"run: minutes must be a positive number; got {self.minutes!r}")
+        check_flag("run", "tensorboard", self.tensorboard)
+        if self.channels_last is not None:
+            check_flag("run", "channels_last", self.channels_last)
+        for name in ("minutes", "cpu_minutes"):
+            value = getattr(self, name)
+            if value is not None and not check_number("run", name, value, "a positive number") > 0:
+                raise OptionError(f"run: {name} must be a positive number; got {value!r}")
         if not 0 <= check_number("run", "max_bad_fraction", self.max_bad_fraction, "a share in [0, 1]") <= 1:
             raise OptionError(f"run: max_bad_fraction must be a share in [0, 1]; got {self.max_bad_fraction!r}")
-        if self.steps is None and self.minutes is None:
-            raise OptionError("run: steps or minutes must say when the run ends; got neither")
+        if self.steps is None and self.minutes is None and self.cpu_minutes is None:
+            raise OptionError("run: steps, minutes or cpu_minutes must say when the run ends; got none")
 
 
 # What a resumed run may do otherwise than before: nothing of it changes what is learnt from a step.
@@ -242,8 +255,10 @@ class TrainingConfig:
                 "run: loss_views must be 'every' or 'last' where shapes have differently many views; "
                 f"got 'random' with data.views = {self.data.views!r}"
             )
-        if self.optimiser.schedule == "cosine" and self.run.steps is None:
-            raise OptionError("run: steps must be given with optimiser.schedule = 'cosine', which ends there; got None")
+        if self.optimiser.schedule == "cosine" and self.run.steps is None and self.run.cpu_minutes is None:
+            raise OptionError(
+                "run: steps or cpu_minutes must be given with optimiser.schedule = 'cosine', which ends there"
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as JSON holds them."""

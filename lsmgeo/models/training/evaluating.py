@@ -57,7 +57,7 @@ class Evaluation:
 
 @torch.no_grad()
 def evaluate_model(
-    model: nn.Module, batches: Iterator[Batch], stop: StopRequest, *, region: str, pictures: int
+    model: nn.Module, batches: Iterator[Batch], stop: StopRequest, *, region: str, loss: str, pictures: int
 ) -> Evaluation | None:
     """Measure a model on batches, which together with those of the other processes are the whole set.
 
@@ -66,6 +66,7 @@ def evaluate_model(
         batches: every shape with V views.
         stop: when it is asked for, in whichever process, nothing is measured.
         region: of the loss of depth.
+        loss: of voxels.
         pictures: how many shapes to keep with what is predicted of them.
 
     Returns:
@@ -82,7 +83,7 @@ def evaluate_model(
             if stop:
                 break
             output = model(batch.images, batch.cameras, batch.view_mask)
-            terms, number = sum_loss(output, batch, region=region)
+            terms, number = sum_loss(output, batch, region=region, loss=loss)
             total, count = total + float(terms), count + float(number)
             names = [name or "all" for name in batch.category]
             if hasattr(output, "logits"):

@@ -120,6 +120,13 @@ class RunLog:
         if found.examples and self.is_writer:
             self.picture(step, "predicted", draw_examples(found.examples))
 
+    def plan(self, steps: int) -> None:
+        """The number of steps is known."""
+        self.event("plan", steps=steps)
+        self.say(f"{steps} steps fill the CPU minutes")
+        if self._bar is not None:
+            self._bar.total = steps
+
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
         """Curves for TensorBoard."""
         if self._board is not None:

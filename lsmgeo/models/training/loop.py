@@ -7,10 +7,11 @@ import json
 import os
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from math import ceil
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lsmgeo.data import Batch, write_atomic
 from lsmgeo.errors import CheckpointError, TrainingError
@@ -23,6 +24,7 @@ from lsmgeo.models.training.feeding import Need, open_shapes, training_batches, 
 from lsmgeo.models.training.guard import StepGuard, are_finite
 from lsmgeo.models.training.logs import RunLog
 from lsmgeo.models.training.optimising import (
+    TIMED_STEPS,
     find_gradients,
     learning_rate,
     loss_steps,
@@ -32,7 +34,7 @@ from lsmgeo.models.training.optimising import (
 from lsmgeo.models.training.processes import any_true, check_agreement, gather
 from lsmgeo.models.training.randomness import random_state, restore_random_state
 from lsmgeo.models.training.signals import StopRequest, catch_stop
-from lsmgeo.models.training.starting import hold_folder, make_model, parameter_checksum, started
+from lsmgeo.models.training.starting import decided, hold_folder, make_model, parameter_checksum, started
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -40,6 +42,8 @@ if TYPE_CHECKING:
 __all__ = ["Trained", "train"]
 
 CONFIG = "config.json"
+# Of the steps that are timed, the first are slower than the others will be.
+SLOW_STEPS = 5
 
 
 @dataclass(frozen=True)
@@ -74,9 +78,11 @@ class Place:
     step: int = 0  # batches that were taken, also those whose gradient was not finite
     moved: int = 0  # steps that moved the parameters
     seconds: float = 0.0
+    cpu_seconds: float = 0.0
     evaluated: int = 0  # the step of the last evaluation
     best: int | None = None
     best_value: float | None = None
+    measured: dict[str, Any] | None = None  # what the last evaluation found
 
 
 def train(config: TrainingConfig, out: str | os.PathLike[str], *, quiet: bool = False) -> Trained:
@@ -100,6 +106,7 @@ def train(config: TrainingConfig, out: str | os.PathLike[str], *, quiet: bool = 
         TrainingError: losses or gradients were not finite, again and again; processes do not start from the same; or
             another process trains in the folder.
     """
+    config = decided(config, Path(out))
     # One layer of the release never gets a gradient, and what convolves the state gets none from a single view.
     has_idle_parameters = config.model.variant == "release" or config.data.view_range[0] == 1
     with (
@@ -130,9 +137,11 @@ def _train(
     guard = StepGuard(in_a_row=run.max_bad_steps, share=run.max_bad_fraction)
     place = Place()
 
-    identity = {**config.to_dict(), "processes": processes, "shapes": shapes.identity}
+    def identity() -> dict[str, Any]:
+        return {**config.to_dict(), "processes": processes, "shapes": shapes.identity}
+
     if checkpoint is not None:
-        check_config(checkpoint, identity, free=config.free())
+        check_config(checkpoint, identity(), free=config.free())
         checkpoint.restore_model(model)
         checkpoint.restore("optimiser", optimiser)
         checkpoint.restore("guard", guard)
@@ -145,7 +154,7 @@ def _train(
             # What was measured on other shapes or views is no measure of what comes.
             place.best = place.best_value = None
     check_agreement(
-        {"the configuration": identity, "the step": place.step, "the parameters": parameter_checksum(model)}
+        {"the configuration": identity(), "the step": place.step, "the parameters": parameter_checksum(model)}
     )
 
     wrapped = accelerator.prepare_model(model)
@@ -167,7 +176,7 @@ def _train(
     weights = sum(parameter.numel() for parameter in model.parameters())
     evaluation: Evaluation | None = None
     ended = ""
-    begin = time.monotonic() - place.seconds
+    begin, cpu_begin = time.monotonic() - place.seconds, time.process_time() - place.cpu_seconds
     # Told before the work, not after.
     if rank == 0:
         write_atomic(folder / CONFIG, json.dumps(config.to_dict(), indent=1).encode())
@@ -177,7 +186,7 @@ def _train(
 
     def save(*, must: bool) -> None:
         nonlocal saved, saved_step
-        place.seconds = time.monotonic() - begin
+        place.seconds, place.cpu_seconds = time.monotonic() - begin, time.process_time() - cpu_begin
         epoch, position = divmod(place.step * taken_a_step, len(shapes))
         state = {
             "optimiser": optimiser.state_dict(),
@@ -195,7 +204,8 @@ def _train(
                     place.step,
                     model=model,
                     state=state,
-                    config=identity,
+                    config=identity(),
+                    about={} if place.measured is None else {"validation": place.measured},
                     keep=run.keep,
                     best=place.best,
                 )
@@ -212,6 +222,33 @@ def _train(
         else:
             warnings.warn(f"{reason}; the run goes on without this checkpoint", stacklevel=3)
 
+    def measure(shapes: int, pictures: int) -> Evaluation | None:
+        with contextlib.closing(
+            validation_batches(
+                held_back,
+                seed=run.seed,
+                count=shapes,
+                batch=run.batch,
+                device=device,
+                workers=min(1, data.workers),
+                rank=rank,
+                processes=processes,
+            )
+        ) as some:
+            return evaluate_model(model, some, stop, region=run.region, loss=run.loss, pictures=pictures)
+
+    def planned(minutes: float, timed: Sequence[float]) -> int:
+        """The number of steps that fill the CPU minutes, by the time of a step and of an evaluation."""
+        step_seconds = sum(timed) / len(timed)
+        begun = time.process_time()
+        measure(run.batch * processes, 0)
+        batches_of_all = ceil(min(run.evaluate_shapes, len(held_back)) / (run.batch * processes))
+        evaluation_seconds = (time.process_time() - begun) * batches_of_all
+        left = 60 * minutes - (time.process_time() - cpu_begin) - evaluation_seconds
+        more = int(left / (step_seconds + evaluation_seconds / run.evaluate_every))
+        return gather(place.step + max(1, more))[0]
+
+    timed: list[float] = []
     # Closed whatever happens: the readers are deaf to the signals with which Python ends its children.
     with log, contextlib.closing(batches):
         log.event(
@@ -236,43 +273,38 @@ def _train(
 
             if place.step > place.evaluated and ended != "stop" and (ended or place.step % run.evaluate_every == 0):
                 begun = time.monotonic()
-                with contextlib.closing(
-                    validation_batches(
-                        held_back,
-                        seed=run.seed,
-                        count=run.evaluate_shapes,
-                        batch=run.batch,
-                        device=device,
-                        workers=min(1, data.workers),
-                        rank=rank,
-                        processes=processes,
-                    )
-                ) as held_back_batches:
-                    found = evaluate_model(
-                        model,
-                        held_back_batches,
-                        stop,
-                        region=run.region,
-                        pictures=run.pictures if rank == 0 else 0,
-                    )
+                found = measure(run.evaluate_shapes, run.pictures if rank == 0 else 0)
                 if found is None:
                     ended = "stop"
                 else:
                     evaluation, place.evaluated = found, place.step
+                    place.measured = {
+                        "step": place.step,
+                        "measure": found.measure,
+                        "by_view": [*found.by_view.values()],
+                    }
                     # Whatever was saved of this step does not know of it.
                     saved_step = None
                     if found.is_better_than(place.best_value):
                         place.best, place.best_value = place.step, found.value
                     log.evaluation(place.step, found, seconds=time.monotonic() - begun, best=place.best)
 
-            is_due = ended or place.step % run.checkpoint_every == 0 or place.step == place.best
+            if run.steps is None and run.cpu_minutes is not None and place.step >= TIMED_STEPS and not ended:
+                steps = planned(run.cpu_minutes, timed[SLOW_STEPS:] or timed)
+                run = replace(run, steps=steps)
+                config = replace(config, run=run)
+                if rank == 0:
+                    write_atomic(folder / CONFIG, json.dumps(config.to_dict(), indent=1).encode())
+                log.plan(steps)
+                saved_step = None
+            is_due = ended or place.step % run.checkpoint_every == 0 or place.step in (place.best, TIMED_STEPS)
             if is_due and place.step != saved_step:
                 # The first tells before the work whether the folder can be written.
                 save(must=bool(ended) or place.step == 0)
             if ended:
                 break
 
-            begun = time.monotonic()
+            begun, cpu_begun = time.monotonic(), time.process_time()
             taken = fetch(batches, run.accumulation, stop)
             waited = time.monotonic() - begun
             if any_true(taken is None or bool(stop)):
@@ -290,10 +322,12 @@ def _train(
                 accelerator,
                 steps=loss_steps(run, place.step, most),
                 region=run.region,
+                loss=run.loss,
                 terms=terms,
             )
             place.step += 1
-            rate = learning_rate(config.optimiser, place.moved, run.steps)
+            hold = TIMED_STEPS if run.cpu_minutes is not None else 0
+            rate = learning_rate(config.optimiser, place.moved, run.steps, hold=hold)
             if gradients.is_finite:
                 guard.admits(place.step, is_bad=False)
                 move_parameters(optimiser, accelerator, gradients, rate=rate, clip=config.optimiser.clip_norm)
@@ -321,6 +355,7 @@ def _train(
             optimiser.zero_grad()
 
             seconds = time.monotonic() - begun
+            timed.append(time.process_time() - cpu_begun)
             if place.step % run.log_every == 0:
                 log.step(
                     place.step,
@@ -332,7 +367,13 @@ def _train(
                     waited=waited,
                 )
             log.progress(place.step, f"loss {gradients.loss:.4f}, {seconds:.2f} s a step")
-        log.event("stop", step=place.step, reason=ended, seconds=round(place.seconds, 1))
+        log.event(
+            "stop",
+            step=place.step,
+            reason=ended,
+            seconds=round(place.seconds, 1),
+            cpu_seconds=round(time.process_time() - cpu_begin, 1),
+        )
     assert saved is not None
     return Trained(folder, place.step, saved, place.best, evaluation, ended, rank == 0, stop.exit_code)
 

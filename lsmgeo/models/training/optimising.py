@@ -19,9 +19,19 @@ from lsmgeo.models.training.randomness import seeded_generator
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
-__all__ = ["Gradients", "find_gradients", "learning_rate", "loss_steps", "make_optimiser", "move_parameters"]
+__all__ = [
+    "TIMED_STEPS",
+    "Gradients",
+    "find_gradients",
+    "learning_rate",
+    "loss_steps",
+    "make_optimiser",
+    "move_parameters",
+]
 
 Steps = str | Sequence[int] | None
+# How many are timed where CPU minutes say when a run ends.
+TIMED_STEPS = 30
 
 
 class Gradients(NamedTuple):
@@ -58,6 +68,7 @@ def find_gradients(
     *,
     steps: Steps,
     region: str,
+    loss: str,
     terms: float,
 ) -> Gradients:
     """The loss of some batches in every process, and its gradient in the parameters' ``grad``.
@@ -72,14 +83,18 @@ def find_gradients(
         accelerator: of the run.
         steps: after which views the loss is taken, see `loss_steps`.
         region: of the loss of depth.
+        loss: of voxels.
         terms: about how many terms a batch has: sums are divided by it, so that gradients are of an ordinary size.
     """
     sums = torch.zeros(2, device=accelerator.device)
     for index, batch in enumerate(batches):
         is_last = index == len(batches) - 1
         with contextlib.nullcontext() if is_last else accelerator.no_sync(wrapped):
+            if isinstance(steps, list) and batch.depth is None:
+                # What is read after the last of them reaches no loss of voxels.
+                batch = batch.first_views(max(steps) + 1)
             output = wrapped(batch.images, batch.cameras, batch.view_mask, steps=steps)
-            part, number = sum_loss(output, batch, region=region, steps=steps)
+            part, number = sum_loss(output, batch, region=region, loss=loss, steps=steps)
             accelerator.backward(part / terms)
         sums += torch.stack((part.detach(), number))
     if accelerator.num_processes > 1:
@@ -117,16 +132,17 @@ def move_parameters(
         accelerator.scaler.step(optimiser)
 
 
-def learning_rate(config: OptimiserConfig, taken: int, steps: int | None) -> float:
+def learning_rate(config: OptimiserConfig, taken: int, steps: int | None, *, hold: int = 0) -> float:
     """The learning rate of a step.
 
-    Equation: with t = steps taken before, w = warm_up and n = steps: ``min(1, (t + 1) / w)`` times the configured rate,
-    and with a cosine times ``(1 + cos(pi t / n)) / 2``.
+    Equation: with t = steps taken before, w = warm_up, n = steps and h = hold: ``min(1, (t + 1) / w)`` times the
+    configured rate, and with a cosine times ``(1 + cos(pi max(0, t - h) / (n - h))) / 2``.
 
     Args:
         config: of the optimiser.
         taken: how many steps moved the parameters before; skipped ones do not count.
-        steps: where the run ends.
+        steps: where the run ends; None where that is not known yet, in the first `hold` steps.
+        hold: steps before a cosine begins.
 
     Example:
         >>> config = OptimiserConfig(learning_rate=1.0, schedule="cosine", warm_up=4)
@@ -137,7 +153,7 @@ def learning_rate(config: OptimiserConfig, taken: int, steps: int | None) -> flo
     if config.warm_up:
         rate *= min(1.0, (taken + 1) / config.warm_up)
     if config.schedule == "cosine" and steps is not None:
-        rate *= 0.5 * (1 + math.cos(math.pi * min(1.0, taken / steps)))
+        rate *= 0.5 * (1 + math.cos(math.pi * min(1.0, max(0, taken - hold) / max(1, steps - hold))))
     return rate
 
 

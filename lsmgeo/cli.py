@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Callable, Iterable, Sequence
+from inspect import signature
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from contextlib import ExitStack
@@ -274,7 +275,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: Sequence[str] | None) -> int:
     from importlib.metadata import PackageNotFoundError, version
 
-    from jsonargparse import auto_cli
+    from jsonargparse import ActionYesNo, ArgumentParser, auto_cli
 
     from lsmgeo.models.commands import evaluate, reconstruct, train
 
@@ -282,18 +283,29 @@ def _run(arguments: Sequence[str] | None) -> int:
         release = version("lsmgeo")
     except PackageNotFoundError:
         from lsmgeo import __version__ as release
+
+    class Parser(ArgumentParser):
+        """Booleans are flags: ``--quiet`` and ``--no_quiet``."""
+
+        def add_argument(self, *names: Any, **options: Any) -> Any:
+            if options.get("type") is bool and names[0].startswith("--"):
+                del options["type"]
+                options["action"] = ActionYesNo
+            return super().add_argument(*names, **options)
+
+    commands: dict[str, Any] = {
+        "demo": demo,
+        "info": info,
+        "reconstruct": reconstruct,
+        "convert": convert,
+        "render": render,
+        "train": train,
+        "evaluate": evaluate,
+    }
     status = auto_cli(
-        {
-            "demo": demo,
-            "info": info,
-            "reconstruct": reconstruct,
-            "convert": convert,
-            "render": render,
-            "train": train,
-            "evaluate": evaluate,
-        },
-        # jsonargparse appends to a list with "+"; that an option is given again and again is how others do it.
-        args=[re.sub(r"^--set(?==|$)", "--set+", word) for word in (sys.argv[1:] if arguments is None else arguments)],
+        commands,
+        args=_plain(sys.argv[1:] if arguments is None else arguments, commands.values()),
+        parser_class=Parser,
         as_positional=True,
         prog="lsmgeo",
         version=release,
@@ -303,6 +315,17 @@ def _run(arguments: Sequence[str] | None) -> int:
         allow_abbrev=False,
     )
     return status if isinstance(status, int) else 0
+
+
+def _plain(words: Sequence[str], commands: Iterable[Callable[..., object]]) -> list[str]:
+    """Arguments as the parser has them: ``--quiet true`` as the flag ``--quiet``, every ``--set`` as one more."""
+    parameters = (parameter for command in commands for parameter in signature(command).parameters.values())
+    flags = "|".join(sorted({parameter.name for parameter in parameters if parameter.annotation == "bool"}))
+    text = "\0".join(words)
+    text = re.sub(rf"(?<![^\0])--({flags})[=\0](true|yes)(?![^\0])", r"--\1", text)
+    text = re.sub(rf"(?<![^\0])--({flags})[=\0](false|no)(?![^\0])", r"--no_\1", text)
+    # jsonargparse appends to a list with "+"; that an option is given again and again is how others do it.
+    return re.sub(r"(?<![^\0])--set(?![^=\0])", "--set+", text).split("\0") if words else []
 
 
 def _reason(message: str) -> str:

@@ -97,7 +97,7 @@ def evaluate(
         split=split,
     )
     made = evaluation.evaluate(contenders, found, report, options)
-    print(f"data:     {found.about}")
+    print(f"data:     {found.about}" + ("" if shards is None else f", {Path(shards).resolve()}"))
     for contender in contenders:
         print(f"model:    {contender.name}, {contender.path}")
     for table in made.tables:

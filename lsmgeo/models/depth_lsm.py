@@ -13,10 +13,10 @@ from torch.nn.functional import interpolate
 from lsmgeo._checks import check_flag
 from lsmgeo.cameras.tensors import Cameras, CameraTensors, image_sizes
 from lsmgeo.errors import OptionError
-from lsmgeo.grids import depth_planes
+from lsmgeo.grids import VoxelGrid, depth_planes
 from lsmgeo.layers import PlaneSweepProject
 from lsmgeo.models.blocks import Block, Convolution, InstanceNorm
-from lsmgeo.models.machine import Machine, evaluating, views_of
+from lsmgeo.models.machine import Machine, evaluating, moved_center, views_of
 from lsmgeo.models.outputs import DepthOutput, DepthResult
 from lsmgeo.models.settings import DepthSettings, changed
 from lsmgeo.rays import ProjectReduce
@@ -103,11 +103,16 @@ class DepthLSM(Machine):
         self.settings = settings
         is_release = settings.variant == "release"
         planes = depth_planes(settings.near, settings.far, settings.planes)
+        swept = self.grid
+        if settings.pixel_rules == "release":
+            # round() of an index that counts from the box's side: every voxel is read half a voxel back.
+            back = 0.5 / settings.grid_size
+            swept = VoxelGrid(settings.grid_size, -0.5 - back, 0.5 - back)
         channels, early = self.grid_network.out_channels, settings.encoder_channels
         level = settings.map_stride.bit_length() - 2  # of the early map that has the swept maps' size
         self.sweep: PlaneSweepProject | ProjectReduce
         if is_release:
-            self.sweep = PlaneSweepProject(self.grid, planes, mode=settings.projection)
+            self.sweep = PlaneSweepProject(swept, planes, mode=settings.projection)
             stacked, (reduced,) = channels * settings.planes, settings.ray_channels
             self.rays = nn.Sequential(
                 _Separable(stacked, reduced, activate=False), _Separable(reduced, early[level], activate=True)
@@ -117,7 +122,7 @@ class DepthLSM(Machine):
             self.sweep = ProjectReduce(
                 channels,
                 first,
-                self.grid,
+                swept,
                 planes,
                 bias=False,
                 mode=settings.projection,
@@ -171,6 +176,9 @@ class DepthLSM(Machine):
         B, S = grids.shape[:2]
         targets = views_of(self.name, cameras if target_cameras is None else target_cameras, B)
         mask = view_mask if target_cameras is None else None
+        if self.settings.pixel_rules == "release":
+            # Rays pass the corner of a map's pixels.
+            targets = moved_center(self.name, targets, -0.5)
         views = (B * S, targets.cam_from_world.shape[1])
         size = (images.shape[-2] // self.settings.map_stride, images.shape[-1] // self.settings.map_stride)
         maps, _ = self.sweep(

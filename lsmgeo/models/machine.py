@@ -21,7 +21,7 @@ from lsmgeo.models.model import Model
 from lsmgeo.models.outputs import chosen_steps
 from lsmgeo.models.settings import MachineSettings
 
-__all__ = ["Machine", "Seen", "evaluating", "views_of"]
+__all__ = ["Machine", "Seen", "evaluating", "moved_center", "views_of"]
 
 
 class Seen(NamedTuple):
@@ -38,11 +38,14 @@ class Machine(Model):
         super().__init__()
         is_release = settings.variant == "release"
         self.image_size = settings.image_size
+        # The release takes pixel j of a map at j times its stride: the camera's image lies aside by so many pixels.
+        has_release_rules = settings.pixel_rules == "release"
+        self.lift_offset = (settings.feature_stride - 1) / 2 if has_release_rules else 0.0
         self.resolution = settings.grid_size
         self.grid = VoxelGrid(settings.grid_size)
         self.image_encoder = ImageEncoder(settings)
         # "zeros": what lies outside an image is told apart from what looks like its border; the release smears that.
-        padding_mode = "border" if is_release else "zeros"
+        padding_mode = "border" if is_release or has_release_rules else "zeros"
         self.unproject = Unproject(
             self.grid, padding_mode=padding_mode, augment="depth" if is_release else ("depth", "direction")
         )
@@ -78,6 +81,8 @@ class Machine(Model):
 
     def _unproject(self, features: Tensor, cameras: Cameras, view_mask: Tensor | None) -> Tensor:
         """The volume (B, V, C, D, H, W) of every view: its samples, sub-voxel by sub-voxel, depth and direction."""
+        if self.lift_offset:
+            cameras = moved_center(self.name, cameras, self.lift_offset)
         if self.lift == 1:
             return self.unproject(features, cameras, view_mask).volume
         samples = self.unproject_finely(features, cameras, view_mask).volume
@@ -98,6 +103,14 @@ class Machine(Model):
             check_mask(self.name, "view_mask", view_mask, tuple(images.shape[:2]), "(B, V)")
             check_devices(self.name, images=images, view_mask=view_mask)
         return V
+
+
+def moved_center(who: str, cameras: Cameras, pixels: float) -> CameraTensors:
+    """Cameras whose principal points lie so many pixels of the image further right and down."""
+    tensors = as_tensors(cameras, who)
+    offset = torch.zeros_like(tensors.intrinsics)
+    offset[..., :2, 2] = pixels
+    return tensors._replace(intrinsics=tensors.intrinsics + offset)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Settings by name: "paper" as published, "compact" for an hour of two CPU cores, "tiny" for tests."""
+"""Settings by name: "paper" as published, "compact" and "standard" for CPUs, "tiny" for tests."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ _TINY: dict[str, Any] = {
     "grid_skip": True,
 }
 _COMPACT_R2N2: dict[str, Any] = {
-    "image_size": 64,
-    "channels": (32, 64, 96, 128, 128),
-    "shortcuts": ("none", "convolution", "convolution", "convolution", "identity"),
+    "image_size": 128,
+    "channels": (16, 32, 64, 96, 128, 128),
+    "shortcuts": ("none", "convolution", "convolution", "convolution", "convolution", "identity"),
     "features": 256,
     "pose_features": 64,
     "hidden": 64,
@@ -70,16 +70,19 @@ PRESETS: dict[str, dict[str, Any]] = {
     "depth-lsm": {
         "paper": DepthSettings(),
         "compact": DepthSettings(**_COMPACT, planes=24, ray_channels=(128, 64), projection="trilinear"),
+        "standard": DepthSettings(**_STANDARD, planes=24, ray_channels=(128, 64), projection="trilinear"),
         "tiny": DepthSettings(**_TINY, planes=8, ray_channels=(16, 12), projection="trilinear"),
     },
     "r2n2": {
         "paper": R2N2Settings(),
         "compact": R2N2Settings(**_COMPACT_R2N2),
+        "standard": R2N2Settings(**_COMPACT_R2N2),
         "tiny": R2N2Settings(**_TINY_R2N2),
     },
     "r2n2-pose": {
         "paper": R2N2Settings(pose=True),
         "compact": R2N2Settings(pose=True, **_COMPACT_R2N2),
+        "standard": R2N2Settings(pose=True, **_COMPACT_R2N2),
         "tiny": R2N2Settings(pose=True, **_TINY_R2N2),
     },
 }

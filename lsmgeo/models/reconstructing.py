@@ -38,7 +38,7 @@ from lsmgeo.models.placing import (
     spread_views,
 )
 from lsmgeo.models.voxel_lsm import VoxelLSM
-from lsmgeo.models.weights import load
+from lsmgeo.models.weights import load, read_weights
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -60,6 +60,8 @@ FINER, FINEST = 4, 128
 # Depth maps of a model agree with each other to about that; what fusing takes for noise, in sizes of the object.
 AGREEMENT, TRUNCATION = 0.02, 0.05
 SPECK_FACES = 20
+# On the validation split: a network below this IoU, or above this depth error, has barely begun to learn.
+LEAST_IOU, LARGEST_ERROR = 0.3, 0.1
 # Rays along which the largest probability is looked for, and how often.
 LARGEST_SAMPLED, PLANES = 192, 96
 
@@ -184,7 +186,8 @@ def learnt_results(
             f"a cube of {found.placement.side:.4g} about {x:.4g}, {y:.4g}, {z:.4g}, told by {found.placement.told_by}",
         ),
     )
-    results = Results(title, facts, found.notes, (), np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8), None)
+    notes = (*_barely_trained(weights), *found.notes)
+    results = Results(title, facts, notes, (), np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8), None)
     if method == "v-lsm":
         return _with_voxels(scene, results, found, model.grid, threshold, resolution, size)
     return _with_depth(results, found, model.grid, resolution)
@@ -332,6 +335,20 @@ def _load(method: str, weights: str | os.PathLike[str] | None) -> VoxelLSM | Dep
         f"reconstruct: method {method} needs weights of a {METHODS[method].name}; {os.fspath(weights)} holds those of "
         f"a {name}: {other}"
     )
+
+
+def _barely_trained(weights: str | os.PathLike[str] | None) -> tuple[str, ...]:
+    """A note where training left a network that is still bad on its validation split, as its file says."""
+    assert weights is not None
+    validation: Any = read_weights(weights).about.get("validation")
+    try:
+        is_iou, value, step = validation["measure"] == "iou", float(validation["by_view"][-1]), int(validation["step"])
+    except (TypeError, KeyError, IndexError, ValueError):
+        return ()
+    if not (value < LEAST_IOU if is_iou else value > LARGEST_ERROR):
+        return ()
+    measured = f"IoU is {100 * value:.0f} %" if is_iou else f"median depth error is {value:.2f} of the object's size"
+    return (f"The network is barely trained: its {measured} on the validation split at step {step}.",)
 
 
 def _cube(box: str) -> list[float]:

@@ -35,6 +35,9 @@ class MachineSettings:
         hidden_channels: of the recurrence's state.
         grid_channels: of the grid network's levels; 64^3 grids take a fourth of 256.
         output_channels: of the grid network's last layer.
+        pixel_rules: "exact", or "release" for the three rules of the released code, which are half a pixel or voxel
+            off: a map's pixel j is taken to lie at j times its stride, a swept map's half a pixel aside, and a sweep
+            reads the voxel half a voxel back. What right geometry buys is measured against it.
         grid_skip: whether the fused grid itself goes beside it; neither the paper nor the release has this skip, which
             small networks need: it is the one way for detail of the grid's own size.
     """
@@ -52,6 +55,7 @@ class MachineSettings:
     hidden_channels: int = 32
     grid_channels: tuple[int, ...] = (32, 64, 128)
     output_channels: int = 32
+    pixel_rules: str = "exact"
     grid_skip: bool = False
 
     @property
@@ -63,6 +67,7 @@ class MachineSettings:
         """Raise an `OptionError` that names the first impossible setting."""
         check_choice(who, "variant", self.variant, VARIANTS)
         check_choice(who, "fusion", self.fusion, ("gru", "lstm"))
+        check_choice(who, "pixel_rules", self.pixel_rules, ("exact", "release"))
         for name in ("feature_channels", "hidden_channels", "output_channels"):
             check_whole(who, name, getattr(self, name), 1, LARGEST_SIDE)
         check_flag(who, "grid_skip", self.grid_skip)

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
+from lsmgeo._checks import check_flag
 from lsmgeo.data.files import read_bytes, write_atomic
 from lsmgeo.errors import CheckpointError, DataError, LsmGeoError, OptionError
 from lsmgeo.models.creating import from_settings, settings_of
@@ -72,13 +73,16 @@ class Weights:
     tensors: Mapping[str, Tensor]
 
 
-def write_weights(path: str | os.PathLike[str], model: nn.Module, *, about: Mapping[str, Any] | None = None) -> Path:
+def write_weights(
+    path: str | os.PathLike[str], model: nn.Module, *, about: Mapping[str, Any] | None = None, half: bool = False
+) -> Path:
     """Write a model to one file that `load` makes the model from, atomically.
 
     Args:
         path: the file, by custom ``.safetensors``.
         model: from `create`.
         about: notes to keep with the weights, in types that JSON has.
+        half: whether float32 weights are kept as float16, in half the space; `load` makes them float32 again.
 
     Returns:
         The path written.
@@ -96,7 +100,7 @@ def write_weights(path: str | os.PathLike[str], model: nn.Module, *, about: Mapp
         'voxel-lsm'
     """
     try:
-        return write_atomic(path, encode_weights(model, about=about))
+        return write_atomic(path, encode_weights(model, about=about, half=half))
     except DataError as error:
         raise CheckpointError(path, error.reason) from error
 
@@ -121,7 +125,10 @@ def load(path: str | os.PathLike[str]) -> Model:
         except (LsmGeoError, TypeError, ValueError, KeyError, RuntimeError) as error:
             raise CheckpointError(weights.path, f"holds settings of no model ({str(error)[:400]})") from error
     _check_fit(model, weights)
-    model.load_state_dict({name: tensor.clone() for name, tensor in weights.tensors.items()}, assign=True)
+    dtypes = {name: tensor.dtype for name, tensor in model.state_dict().items()}
+    model.load_state_dict(
+        {name: tensor.to(dtypes[name], copy=True) for name, tensor in weights.tensors.items()}, assign=True
+    )
     return model.eval()
 
 
@@ -158,12 +165,13 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
     raise CheckpointError(path, f"holds neither {WEIGHTS} nor a checkpoint")
 
 
-def encode_weights(model: nn.Module, *, about: Mapping[str, Any] | None = None) -> bytes:
+def encode_weights(model: nn.Module, *, about: Mapping[str, Any] | None = None, half: bool = False) -> bytes:
     """The bytes of a file of weights.
 
     Args:
         model: from `create`.
         about: notes to keep with the weights, in types that JSON has.
+        half: see `write_weights`.
 
     Returns:
         The content of a safetensors file.
@@ -172,6 +180,10 @@ def encode_weights(model: nn.Module, *, about: Mapping[str, Any] | None = None) 
         OptionError: notes that JSON cannot hold.
     """
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in model.state_dict().items()}
+    if check_flag("write_weights", "half", half):
+        tensors = {name: tensor.half() if tensor.dtype == torch.float32 else tensor for name, tensor in tensors.items()}
+        if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
+            raise OptionError("write_weights: half must be False for weights that are not finite in float16")
     try:
         notes = {name: json.dumps(value, allow_nan=False) for name, value in (("about", dict(about or {})),)}
     except (TypeError, ValueError) as error:
@@ -272,12 +284,12 @@ def _check_fit(model: nn.Module, weights: Weights) -> None:
         if name not in expected:
             raise CheckpointError(weights.path, f"holds {name}, which the model has not")
         want, have = _describe(expected[name]), _describe(weights.tensors[name])
-        if want != have:
+        if have != want and have != _describe(expected[name], torch.float16):
             raise CheckpointError(weights.path, f"holds {name} as {have}; the model has {want}")
 
 
-def _describe(tensor: Tensor) -> str:
-    return f"{tuple(tensor.shape)} {str(tensor.dtype).removeprefix('torch.')}"
+def _describe(tensor: Tensor, dtype: torch.dtype | None = None) -> str:
+    return f"{tuple(tensor.shape)} {str(dtype or tensor.dtype).removeprefix('torch.')}"
 
 
 def _checksum(metadata: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:

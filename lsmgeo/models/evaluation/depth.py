@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lsmgeo.cameras import select
+from lsmgeo.data import Batch
 from lsmgeo.errors import OptionError
 from lsmgeo.metrics import depth_errors, median_depth_error
 from lsmgeo.models.evaluation.contenders import Contender, pick
@@ -15,13 +16,18 @@ from lsmgeo.models.evaluation.facts import facts_of
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.paper import DEPTH, paper_categories
 from lsmgeo.models.evaluation.plane_sweeps import SURE, SWEEP, Swept, sweep_views
+from lsmgeo.models.evaluation.plots import sheet
 from lsmgeo.models.evaluation.report import Cell, Report, Row, Table
 from lsmgeo.models.evaluation.scores import Scores, joined
+from lsmgeo.models.evaluation.sequences import as_picture
 from lsmgeo.models.evaluation.shapes import Shapes, SizedShapes, batches
+from lsmgeo.models.pictures import Picture, draw_depth
 
 __all__ = ["report_depth"]
 
 VIEWS = 10
+# Of a picture: side in pixels, and the shapes that are drawn.
+SIDE, MOST_DRAWN = 160, 13
 MEASURES = ("median", "mean", "median, sure", "median, all", "mean, all", "has depth [%]", "is sure [%]")
 
 
@@ -52,6 +58,7 @@ def report_depth(contenders: Sequence[Contender], shapes: Shapes, options: Optio
     if views < 2:
         raise OptionError("evaluate: report 'depth' needs two views at least, which plane sweep matches")
     scores = {name: Scores() for name in (SWEEP, *(contender.name for contender in contenders))}
+    rows_drawn: dict[str, list[Picture | None]] = {}
     sized = SizedShapes(shapes, size)
     for batch in batches(sized, views, options.batch, resolution=None, depth=True, progress=options.progress):
         assert batch.depth is not None
@@ -64,6 +71,8 @@ def report_depth(contenders: Sequence[Contender], shapes: Shapes, options: Optio
         found = {SWEEP: swept.depth} | {one.name: one.depths(batch.images, batch.cameras) for one in contenders}
         for name, depth in found.items():
             scores[name].add(batch.name, batch.category, _errors(depth, batch.depth, batch.mask, swept))
+        for place, shape in enumerate(batch.name[: MOST_DRAWN - len(rows_drawn)]):
+            rows_drawn[shape] = _draw(batch, place, list(found.values()))
     categories = sorted(set(shapes.categories))
     rows = [Row(name, one.category_cells(0, categories)) for name, one in scores.items()]
     known = [name for name in DEPTH if name == SWEEP or name in {one.title for one in contenders}]
@@ -77,6 +86,14 @@ def report_depth(contenders: Sequence[Contender], shapes: Shapes, options: Optio
         ],
         facts_of(contenders, shapes, options, views=views, planes=options.planes, window=options.window, size=size),
         joined(scores, ", ".join(MEASURES).replace(" [%]", "")),
+        {
+            "depth": sheet(
+                list(rows_drawn.values()),
+                list(rows_drawn),
+                ["first view", "truth", *scores],
+                title=f"depth of the first view, seen from aside; {shapes.about}",
+            )
+        },
         notes=notes,
     )
 
@@ -108,6 +125,15 @@ def _errors(predicted: Tensor, depth: Tensor, mask: Tensor, swept: Swept) -> Ten
         sure.sum((-2, -1)) / pixels,
     ]
     return torch.stack([column.double().nanmean(1) for column in columns], 1)
+
+
+def _draw(batch: Batch, place: int, depths: Sequence[Tensor]) -> list[Picture | None]:
+    """The first view of a shape, its true depth, and what methods (B, V, H, W) say, as shaded surfaces."""
+    assert batch.depth is not None
+    assert batch.mask is not None
+    camera, on = select(select(batch.cameras, 0, place), 0, 0), batch.mask[place, 0]
+    surfaces = [torch.where(on, depth[place, 0].float(), 0.0) for depth in (batch.depth, *depths)]
+    return [as_picture(batch.images[place, 0], SIDE), *(draw_depth(one, camera, size=SIDE) for one in surfaces)]
 
 
 def _percent(cell: Cell) -> Cell:

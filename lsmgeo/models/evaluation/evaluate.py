@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 from lsmgeo._checks import check_choice
 from lsmgeo.models.evaluation.backgrounds import report_backgrounds
@@ -62,4 +63,11 @@ def evaluate(
         ['V-LSM', 'visual hull', 'visual hull, strict', 'paper, V-LSM', 'paper, visual hull']
     """
     make = REPORTS[check_choice("evaluate", "report", report, tuple(REPORTS))]
-    return make(contenders, shapes, options or Options())
+    made = make(contenders, shapes, options or Options())
+    size = shapes.read(0, 1, resolution=None, depth=False, background="white").images.shape[-1]
+    enlarged = [
+        f"images of {size} pixels were enlarged to the {one.size} of {one.name}: they hold less than it was made for"
+        for one in contenders
+        if one.size > size
+    ]
+    return replace(made, notes=[*made.notes, *enlarged])

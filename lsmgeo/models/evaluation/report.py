@@ -45,6 +45,7 @@ class Table(NamedTuple):
         columns: the names of the cells.
         rows: the lines.
         digits: behind the point, as printed.
+        footnote: what a reader must know of a number.
     """
 
     key: str
@@ -52,6 +53,7 @@ class Table(NamedTuple):
     columns: Sequence[str]
     rows: Sequence[Row]
     digits: int = 1
+    footnote: str = ""
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,8 @@ def format_table(table: Table) -> str:
     ]
     if any(row.is_elsewhere for row in table.rows):
         text.append(f"{MARK} other data")
+    if table.footnote:
+        text.append(table.footnote)
     return "\n".join(text)
 
 
@@ -157,6 +161,7 @@ def _plain(report: Report) -> dict[str, Any]:
         {
             "key": table.key,
             "title": table.title,
+            "footnote": table.footnote,
             "columns": list(table.columns),
             "rows": [
                 {

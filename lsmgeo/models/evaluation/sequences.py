@@ -20,7 +20,7 @@ from lsmgeo.models.pictures import Picture, draw_voxels
 __all__ = ["as_picture", "report_sequences"]
 
 VIEWS = 4
-SIDE = 128
+SIDE = 256
 # More shapes than this are measured, not drawn.
 MOST_DRAWN = 26
 

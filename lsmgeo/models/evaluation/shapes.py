@@ -109,8 +109,8 @@ class ShardShapes:
 
     @property
     def about(self) -> str:
-        """The folder."""
-        return f"{len(self)} shapes of {self.shards.folder}"
+        """The folder's name: where it lies says nothing in a picture."""
+        return f"{len(self)} shapes of {self.shards.folder.resolve().name}"
 
     @property
     def categories(self) -> list[str]:

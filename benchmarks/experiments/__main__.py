@@ -1,0 +1,73 @@
+"""``python -m benchmarks.experiments list | next [NAME] | collect``: see docs/experiments."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.experiments.queue import ALL, QUEUE, Experiment, find
+
+DEFAULT = Path("experiments")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.experiments", description=__doc__)
+    parser.add_argument("command", choices=("list", "next", "collect"))
+    parser.add_argument("name", nargs="?", help="for next: an experiment; by default the first that is not finished")
+    parser.add_argument("--folder", type=Path, default=DEFAULT, help="where the set and the runs lie (%(default)s)")
+    options = parser.parse_args(argv)
+    if options.command == "list":
+        return show(options.folder)
+    # What trains is imported when something is trained.
+    from benchmarks.experiments.collecting import collect
+    from benchmarks.experiments.running import Folder, run_experiment
+
+    folder = Folder(options.folder)
+    if options.command == "collect":
+        for path in collect(folder):
+            print(path)
+        return 0
+    if options.name is not None:
+        return run_experiment(find(options.name), folder)
+    for experiment in QUEUE:
+        if state(experiment, options.folder) != "done":
+            print(f"{experiment.name}: {experiment.what}, {experiment.minutes:g} CPU minutes", file=sys.stderr)
+            return run_experiment(experiment, folder)
+    print("all experiments are done")
+    return 0
+
+
+def show(folder: Path) -> int:
+    """Print what is done and what is next."""
+    from benchmarks.experiments.collecting import RESULTS, headline
+
+    is_next = True
+    for experiment in ALL:
+        found = state(experiment, folder)
+        if found != "done" and not experiment.is_trial and is_next:
+            found, is_next = f"{found}, next" if found else "next", False
+        words = experiment.what
+        if (kept := RESULTS / f"{experiment.name}.json").is_file():
+            words += f": {headline(json.loads(kept.read_text(encoding='utf-8')))}"
+        minutes = f"{experiment.minutes:g} min"
+        print(f"{experiment.name:<24} {minutes:>8}  {found or '-':<14}  {words}")
+    return 0
+
+
+def state(experiment: Experiment, folder: Path) -> str:
+    """How far a run is: "done", also where its results are committed, the step that it has come to, or nothing."""
+    from benchmarks.experiments.collecting import RESULTS
+    from benchmarks.experiments.running import EVALUATION
+
+    run = folder / "runs" / experiment.name
+    if (RESULTS / f"{experiment.name}.json").is_file() or (run / EVALUATION).is_file():
+        return "done"
+    steps = sorted((run / "checkpoints").glob("step_*[0-9]"))
+    return f"at step {int(steps[-1].name.removeprefix('step_'))}" if steps else ""
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,78 @@
+"""What is kept of finished runs: a JSON file each, and the weights that ship. The same run gives the same file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import lsmgeo.models
+from benchmarks import timing
+from benchmarks.experiments.queue import ALL, SET, SHAPES, Experiment
+from benchmarks.experiments.running import EVALUATION, RECIPE, WEIGHTS, Folder
+from benchmarks.training_curve import read_log
+from lsmgeo.data import write_atomic
+
+__all__ = ["PRETRAINED", "RESULTS", "collect", "headline"]
+
+RESULTS = timing.RESULTS / "experiments"
+PRETRAINED = Path(lsmgeo.models.__file__).parent / "pretrained"
+
+
+def collect(folder: Folder) -> list[Path]:
+    """Write what is to be committed of all finished runs.
+
+    Returns:
+        The files.
+    """
+    written = []
+    for experiment in ALL:
+        if folder.is_done(experiment):
+            kept = keep(experiment, folder)
+            path = RESULTS / f"{experiment.name}.json"
+            written.append(write_atomic(path, (json.dumps(kept, indent=1) + "\n").encode()))
+            weights = folder.run(experiment) / WEIGHTS
+            if experiment.ships:
+                name = f"{experiment.model}-{experiment.preset}.safetensors"
+                written.append(write_atomic(PRETRAINED / name, weights.read_bytes()))
+            digest = kept["set"]
+            if not RECIPE.is_file():
+                recipe = {"source": "synthetic-13", "shapes": SHAPES, **SET._asdict(), "sha256": digest}
+                written.append(write_atomic(RECIPE, (json.dumps(recipe, indent=1) + "\n").encode()))
+    return written
+
+
+def keep(experiment: Experiment, folder: Folder) -> dict[str, Any]:
+    """What is kept of a finished run."""
+    path = folder.run(experiment)
+    config = json.loads((path / "config.json").read_text(encoding="utf-8"))
+    config["data"]["source"] = "set"  # where it lies says nothing elsewhere
+    log, start = read_log(path / "log.jsonl")
+    about = {key: value for key, value in asdict(experiment).items() if key in ("what", "minutes", "ships", "is_trial")}
+    return {
+        **about,
+        **json.loads((path / EVALUATION).read_text(encoding="utf-8")),
+        "configuration": config,
+        "shapes": start["shapes"],
+        "held_back": start["held_back"],
+        "curve": log,
+    }
+
+
+def headline(kept: dict[str, Any]) -> str:
+    """The result of a run in a few words: its measure by the number of views."""
+    last = kept["curve"][-1]
+    found = kept["evaluation"]
+    if "iou" in found:
+        values = next(iter(found["iou"].values()))
+        return "test IoU " + " ".join(f"{value:.1f}" for value in values)
+    if "depth_error" in found:
+        return "test depth error " + ", ".join(
+            f"{views} views {one['mean']:.4f}" for views, one in found["depth_error"].items()
+        )
+    measure = "iou" if "iou" in last else "depth_error"
+    factor = 100 if measure == "iou" else 1
+    digits = 1 if measure == "iou" else 4
+    values = " ".join(f"{factor * value:.{digits}f}" for value in last[measure].values())
+    return f"validation {measure.replace('_', ' ')} {values}"

@@ -1,0 +1,156 @@
+"""What is trained, in order. Rows are compared only at equal CPU minutes, which include the evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from lsmgeo.data import Recipe
+from lsmgeo.models.training import TrainingConfig
+from lsmgeo.models.training.config import make_config
+
+__all__ = ["ALL", "EVALUATION_MINUTES", "QUEUE", "SET", "SHAPES", "Experiment", "find"]
+
+# The set of all runs; `set.json` beside this file holds the hash of its values.
+SET = Recipe(seed=0, views=8, size=128, voxels=(32,), depth=True, shadows=False)
+SHAPES = 12_000
+# What is kept of a run's minutes for the evaluation of its weights.
+EVALUATION_MINUTES = {"voxels": 6.0, "depth": 8.0}
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One run.
+
+    Attributes:
+        name: of its folder and of its results.
+        what: what it is for, in words.
+        minutes: of CPU time, evaluation included.
+        model: the network, as `lsmgeo.models.create` knows it.
+        settings: what differs from the network's usual training, as "group.key".
+        preset: of the network.
+        ships: whether its weights become part of the package.
+        is_trial: whether it is no part of the paper's tables: it is measured on the validation split in training alone.
+    """
+
+    name: str
+    what: str
+    minutes: float
+    model: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    preset: str = "standard"
+    ships: bool = False
+    is_trial: bool = False
+
+    @property
+    def output(self) -> str:
+        """What the network gives: "voxels" or "depth"."""
+        return "depth" if self.model == "depth-lsm" else "voxels"
+
+    def config(self, folder: Path) -> TrainingConfig:
+        """The configuration of its training.
+
+        Args:
+            folder: of the shards.
+        """
+        values: dict[str, dict[str, Any]] = {
+            "model": {"name": self.model, "preset": self.preset},
+            "data": {"source": str(folder), "views": 4, "workers": 0},
+            "optimiser": {"schedule": "cosine", "warm_up": 100, "clip_norm": 1.0},
+            "run": {
+                "cpu_minutes": self.minutes - (0 if self.is_trial else EVALUATION_MINUTES[self.output]),
+                "batch": 4,
+                "device": "cpu",
+                "precision": "auto",
+                "loss": "bce+iou",
+                "evaluate_every": 500,
+                "evaluate_shapes": 260,
+                "checkpoint_every": 200,
+                "keep": 1,
+                "tensorboard": False,
+            },
+        }
+        for key, value in {**USUAL[self.model], **self.settings}.items():
+            group, _, name = key.partition(".")
+            values[group][name] = value
+        return make_config(values)
+
+
+USUAL: Mapping[str, Mapping[str, Any]] = {
+    "voxel-lsm": {"optimiser.learning_rate": 2e-3, "run.loss_views": "random"},
+    "depth-lsm": {"optimiser.learning_rate": 2e-3, "run.loss_views": "last"},
+    "r2n2": {"optimiser.learning_rate": 1e-3, "run.loss_views": "random"},
+    "r2n2-pose": {"optimiser.learning_rate": 1e-3, "run.loss_views": "random"},
+}
+
+FIRST, SECOND = {"data.categories": "first"}, {"data.categories": "second"}
+
+QUEUE = (
+    Experiment("vlsm_45", "V-LSM", 45, "voxel-lsm"),
+    Experiment("r2n2_pose_45", "3D-R2N2 with pose", 45, "r2n2-pose"),
+    Experiment("dlsm_45", "D-LSM", 45, "depth-lsm"),
+    Experiment("vlsm_90", "V-LSM, the weights of the package", 90, "voxel-lsm", ships=True),
+    Experiment("dlsm_90", "D-LSM, the weights of the package", 90, "depth-lsm", ships=True),
+    Experiment("r2n2_45", "3D-R2N2", 45, "r2n2"),
+    Experiment("vlsm_bg_45", "V-LSM on random backgrounds", 45, "voxel-lsm", {"data.background": "random"}),
+    Experiment("vlsm_noise_45", "V-LSM with pose noise", 45, "voxel-lsm", {"data.pose_noise": 10.0}),
+    Experiment("vlsm_first_45", "V-LSM on the first categories", 45, "voxel-lsm", FIRST),
+    Experiment("vlsm_second_45", "V-LSM on the second categories", 45, "voxel-lsm", SECOND),
+    Experiment("r2n2_pose_first_45", "3D-R2N2 with pose on the first categories", 45, "r2n2-pose", FIRST),
+    Experiment("r2n2_pose_second_45", "3D-R2N2 with pose on the second categories", 45, "r2n2-pose", SECOND),
+    Experiment(
+        "vlsm_release_rules_45",
+        "V-LSM with the release's three pixel rules: what right geometry buys",
+        45,
+        "voxel-lsm",
+        {"model.settings": {"pixel_rules": "release"}},
+    ),
+    Experiment("r2n2_pose_90", "3D-R2N2 with pose: whether it has come to its plateau", 90, "r2n2-pose"),
+)
+
+# The compact V-LSM and D-LSM of the version before, in float32.
+BEFORE = {
+    "image_size": 64,
+    "encoder_channels": [32, 64, 96],
+    "feature_channels": 28,
+    "lift": 1,
+    "input_kernel": 3,
+    "state_kernel": 3,
+}
+
+# What settings were chosen by, on the validation split; run by name.
+TRIALS = tuple(
+    replace(trial, is_trial=True, preset="standard" if "wide" in trial.name else "compact")
+    for trial in (
+        Experiment(
+            "vlsm_before_5",
+            "V-LSM as it was before, in float32",
+            5,
+            "voxel-lsm",
+            {"model.settings": BEFORE, "run.loss": "bce", "run.loss_views": "every"},
+        ),
+        Experiment("vlsm_every_5", "V-LSM, the loss after every view", 5, "voxel-lsm", {"run.loss_views": "every"}),
+        Experiment("vlsm_bf16_5", "V-LSM in bfloat16", 5, "voxel-lsm", {"run.precision": "bf16"}),
+        Experiment("vlsm_5", "V-LSM", 5, "voxel-lsm"),
+        Experiment("vlsm_20", "V-LSM", 20, "voxel-lsm"),
+        Experiment("vlsm_wide_20", "V-LSM, wider", 20, "voxel-lsm"),
+        Experiment("dlsm_before_10", "D-LSM as it was before, in float32", 10, "depth-lsm", {"model.settings": BEFORE}),
+        Experiment("dlsm_10", "D-LSM", 10, "depth-lsm"),
+    )
+)
+
+ALL = (*TRIALS, *QUEUE)
+
+
+def find(name: str) -> Experiment:
+    """The experiment of a name.
+
+    Raises:
+        SystemExit: there is none.
+    """
+    for experiment in ALL:
+        if experiment.name == name:
+            return experiment
+    raise SystemExit(f"there is no experiment {name!r}; there are {', '.join(one.name for one in ALL)}")

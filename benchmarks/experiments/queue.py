@@ -120,6 +120,8 @@ BEFORE = {
     "state_kernel": 3,
 }
 
+MORE = ["none", "convolution", "convolution", "convolution", "identity", "identity"]
+
 # What settings were chosen by, on the validation split; run by name.
 TRIALS = tuple(
     replace(trial, is_trial=True, preset="standard" if "wide" in trial.name else "compact")
@@ -138,6 +140,23 @@ TRIALS = tuple(
         Experiment("vlsm_wide_20", "V-LSM, wider", 20, "voxel-lsm"),
         Experiment("dlsm_before_10", "D-LSM as it was before, in float32", 10, "depth-lsm", {"model.settings": BEFORE}),
         Experiment("dlsm_10", "D-LSM", 10, "depth-lsm"),
+        Experiment("r2n2_pose_8", "3D-R2N2 with pose", 8, "r2n2-pose"),
+        Experiment("r2n2_pose_slow_8", "3D-R2N2 with pose, 3e-4", 8, "r2n2-pose", {"optimiser.learning_rate": 3e-4}),
+        Experiment("r2n2_pose_fast_8", "3D-R2N2 with pose, 2e-3", 8, "r2n2-pose", {"optimiser.learning_rate": 2e-3}),
+        Experiment(
+            "r2n2_pose_every_8",
+            "3D-R2N2 with pose, the loss after every view",
+            8,
+            "r2n2-pose",
+            {"run.loss_views": "every"},
+        ),
+        Experiment(
+            "r2n2_pose_more_channels_8",
+            "3D-R2N2 with pose, twice the channels",
+            8,
+            "r2n2-pose",
+            {"model.settings": {"channels": [32, 64, 96, 128, 128, 128], "shortcuts": MORE, "hidden": 96}},
+        ),
     )
 )
 

@@ -38,6 +38,8 @@ _TINY: dict[str, Any] = {
     "grid_channels": (8, 12),
     "feature_channels": 8,
     "hidden_channels": 8,
+    "input_kernel": 1,
+    "state_kernel": 1,
     "output_channels": 8,
     "grid_skip": True,
 }

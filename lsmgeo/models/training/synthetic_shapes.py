@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -99,7 +100,7 @@ class SyntheticShapes(Dataset[Described]):
         generator = np.random.default_rng(np.random.SeedSequence([self.seed, epoch, index, 0]))
         count = low + int(generator.random() * (high - low + 1))
         chosen = np.argsort(generator.random(self.config.pool), kind="stable")[:count].tolist()
-        shape = synthetic13.shape(self.config.set_seed, number)
+        shape, occupancy = _made(self.config.set_seed, number, self.voxels)
         cameras = synthetic13.views(self.config.set_seed, number, self.config.pool, self.size)
         cameras = CameraTensors(*(torch.as_tensor(value)[chosen] for value in camera_tools.as_tensors(cameras)))
         behind = [self.background(generator, self.size, self.size) for _ in chosen]
@@ -109,10 +110,18 @@ class SyntheticShapes(Dataset[Described]):
             cameras,
             turn_cameras(cameras, self.noise, self.seed, epoch, index),
             torch.from_numpy(np.stack(behind)),
-            None if self.voxels is None else scenes.voxels([shape.scene], self.voxels)[0],
+            occupancy,
             shape.category,
             shape.name,
         )
+
+
+# Small sets are gone through again and again.
+@lru_cache(maxsize=4096)
+def _made(set_seed: int, number: int, voxels: int | None) -> tuple[synthetic13.SyntheticShape, Tensor | None]:
+    """A shape and its voxels."""
+    shape = synthetic13.shape(set_seed, number)
+    return shape, None if voxels is None else scenes.voxels([shape.scene], voxels)[0]
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,10 @@ def test_iou_of_a_model_is_printed_and_written(weights, tmp_path, capsys):
 
 def test_depth_of_a_model_is_printed_and_written(weights, tmp_path, capsys):
     made = run(tmp_path, weights / "depth-lsm.safetensors", "--shapes", 1, "--views", 2, "--planes", 16)
-    assert made == {"depth.json", "depth.csv"}
+    assert made == {"depth.json", "depth.csv", "depth.png"}
+    with Image.open(tmp_path / "depth.png") as picture:
+        assert picture.width > 4 * 160 + 3 * 4  # the view, the truth, the sweep and the model
+        assert picture.height > 160
     printed = capsys.readouterr().out
     assert "plane sweep" in printed
     assert "paper, D-LSM*" in printed

@@ -75,3 +75,19 @@ def test_what_cannot_be_trained_gives_one_line_and_status_2(configuration, tmp_p
 def test_a_missing_configuration(tmp_path, capsys):
     assert cli.main(["train", str(tmp_path / "none.toml")]) == 2
     assert "none.toml: no such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("place", [1, 2])
+@pytest.mark.parametrize("words", [["--quiet"], ["--quiet", "true"], ["--quiet=yes"], ["--no_quiet", "--quiet"]])
+def test_booleans_are_flags(configuration, tmp_path, capsys, words, place):
+    command = ["train", str(configuration), "--out", str(tmp_path), "--set", "run.steps=1"]
+    assert cli.main([*command[:place], *words, *command[place:]]) == 0
+    assert capsys.readouterr().err == ""
+    for off in (["--quiet", "false"], ["--no_quiet"]):
+        assert cli.main([*command[:place], *off, *command[place:]]) == 0
+        assert "evaluated on" in capsys.readouterr().err
+
+
+def test_a_flag_takes_no_other_value(configuration, capsys):
+    assert cli.main(["train", str(configuration), "--quiet", "maybe"]) == 2
+    assert "maybe" in capsys.readouterr().err

@@ -169,3 +169,13 @@ def test_errors_pass_between_processes():
     error = pickle.loads(pickle.dumps(DataError("some/file", "too short")))
     assert (type(error), error.path, error.reason) == (DataError, "some/file", "too short")
     assert str(error) == "some/file: too short"
+
+
+def test_the_first_views_of_a_batch():
+    batch = collate(SAMPLES)
+    some = batch.first_views(2)
+    assert torch.equal(some.images, batch.images[:, :2])
+    assert torch.equal(some.view_mask, batch.view_mask[:, :2])
+    for found, expected in zip(some.cameras, batch.cameras, strict=True):
+        assert torch.equal(found, expected[:, :2])
+    assert torch.equal(some.occupancy, batch.occupancy)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lsmgeo.errors import DeviceError, DTypeError, OptionError, ShapeError
-from lsmgeo.metrics import voxel_iou
+from lsmgeo.metrics import VoxelIoU, voxel_iou
 
 SHAPE = (3, 2, 4)
 cells = st.sets(st.sampled_from(list(itertools.product(*map(range, SHAPE)))))
@@ -104,3 +104,20 @@ def test_errors_name_the_argument(predicted, occupancy, threshold, error, named)
 def test_tensors_must_share_a_device():
     with pytest.raises(DeviceError, match="predicted on cpu, occupancy on meta"):
         voxel_iou(torch.zeros(SHAPE), torch.zeros(SHAPE, dtype=torch.bool, device="meta"))
+
+
+def test_an_empty_truth_may_be_left_out():
+    truth = torch.zeros(3, 2, 2, 2, dtype=torch.bool)
+    truth[0] = True
+    predicted = torch.zeros(3, 2, 2, 2)
+    predicted[0, 0], predicted[2] = 1.0, 1.0
+    assert voxel_iou(predicted, truth).tolist() == [0.5, 1.0, 0.0]
+    found = voxel_iou(predicted, truth, skip_empty=True)
+    assert found[0] == 0.5
+    assert found[1:].isnan().all()
+    running = VoxelIoU()
+    running.update(predicted, truth, ["car", "car", "rifle"])
+    means = running.compute()
+    assert (means.mean, means.counts) == (0.5, {"car": 1, "rifle": 0})
+    with pytest.raises(OptionError, match="skip_empty must be True or False; got int 1"):
+        voxel_iou(predicted, truth, skip_empty=1)

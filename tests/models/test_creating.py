@@ -16,11 +16,13 @@ from tests.models.inputs import look
 # So that a change of a preset's weights, which makes files of weights useless, is seen.
 COUNTS = {
     ("voxel-lsm", "paper"): 3_412_609,
-    ("voxel-lsm", "compact"): 1_286_276,
-    ("voxel-lsm", "tiny"): 48_320,
+    ("voxel-lsm", "compact"): 1_125_264,
+    ("voxel-lsm", "standard"): 1_736_884,
+    ("voxel-lsm", "tiny"): 35_840,
     ("depth-lsm", "paper"): 4_830_785,
-    ("depth-lsm", "compact"): 1_579_933,
-    ("depth-lsm", "tiny"): 54_209,
+    ("depth-lsm", "compact"): 1_326_489,
+    ("depth-lsm", "standard"): 1_983_805,
+    ("depth-lsm", "tiny"): 41_729,
 }
 
 
@@ -73,9 +75,9 @@ def test_weights_follow_the_seed():
     assert not torch.equal(weights(0), weights(1))
 
 
-def test_every_model_has_the_three_presets():
+def test_every_model_has_the_four_presets():
     assert {name: set(presets) for name, presets in PRESETS.items()} == {
-        name: {"paper", "compact", "tiny"} for name in MODELS
+        name: {"paper", "compact", "standard", "tiny"} for name in MODELS
     }
 
 
@@ -83,7 +85,7 @@ def test_every_model_has_the_three_presets():
     ("call", "message"),
     [
         (lambda: create("voxels-lsm"), r"name must be one of .*; got str 'voxels-lsm' \(is 'voxel-lsm' meant\?\)"),
-        (lambda: create("voxel-lsm", preset="small"), "preset must be one of 'paper', 'compact', 'tiny'"),
+        (lambda: create("voxel-lsm", preset="small"), "preset must be one of 'paper', 'compact', 'standard', 'tiny'"),
         (lambda: create("voxel-lsm", variant="original"), "variant must be one of 'paper', 'release'"),
         (
             lambda: create("voxel-lsm", preset="tiny", variant="release"),

@@ -244,3 +244,30 @@ def test_maps_of_another_stride():
     model = create("depth-lsm", preset="tiny", map_stride=2)
     assert len(model.rise) == 1
     assert tuple(model.run(*look(1, 2)).depth.shape) == (1, 2, 32, 32)
+
+
+def test_the_release_s_rules_of_a_sweep():
+    """Rays through (j + 0.5, i + 0.5) of scaled intrinsics, and voxel round((X + 0.5) n), as the release has it."""
+    torch.manual_seed(0)
+    model = create("depth-lsm", variant="release", image_size=32, grid_size=16, pixel_rules="release", planes=5)
+    images, cameras = look(1, 1)
+    swept = []
+    model.sweep.register_forward_hook(lambda module, given, made: swept.append((given[0], made.maps)))
+    with torch.no_grad():
+        model(images, cameras)
+    grid, maps = swept[0]
+    K, E = cameras.intrinsics[0, 0].double().clone(), cameras.cam_from_world[0, 0].double()
+    K[:2] /= 4
+    depths = torch.linspace(1.0, 3.0, 5, dtype=torch.float64)
+    rows, columns = torch.meshgrid(torch.arange(8.0), torch.arange(8.0), indexing="ij")
+    pixels = torch.stack((columns + 0.5, rows + 0.5, torch.ones(8, 8)), -1).double()
+    rays = pixels @ torch.linalg.inv(K).T
+    points = (depths[:, None, None, None] * rays - E[:3, 3]) @ E[:3, :3]
+    index = ((points + 0.5) * 16).round().long()  # x, y, z
+    inside = ((index >= 0) & (index < 16)).all(-1)
+    x, y, z = torch.where(inside[..., None], index, 0).unbind(-1)
+    expected = torch.where(inside, grid[0][:, z, y, x], 0.0)
+    found = maps.unflatten(2, (-1, 5))[0, 0]
+    # A ray may pass the border of a voxel, where a bit decides.
+    assert float((found == expected).all(0).double().mean()) > 0.995
+    assert int(inside.sum()) > 50

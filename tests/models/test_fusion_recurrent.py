@@ -27,11 +27,17 @@ def volumes(*shape, dtype=torch.float32):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(1), dtype=dtype)
 
 
+def widened(weight):
+    """A kernel as one of 3^3 that is 0 beside its middle."""
+    return weight if weight.ndim != 5 or weight.shape[-1] == 3 else np.pad(weight, ((0, 0),) * 2 + ((1, 1),) * 3)
+
+
 @pytest.mark.parametrize(("recurrence", "run"), [(ConvGRU3d, run_gru), (ConvLSTM3d, run_lstm)])
-def test_states_are_those_of_the_equations(recurrence, run):
-    module = build(recurrence, eps=1e-3).double()
+@pytest.mark.parametrize("kernels", [(3, None), (1, None), (1, 3), (3, 1)])
+def test_states_are_those_of_the_equations(recurrence, run, kernels):
+    module = build(recurrence, kernel_size=kernels[0], state_kernel_size=kernels[1], eps=1e-3).double()
     volume = volumes(2, 3, 3, 3, 2, 4, dtype=torch.float64)
-    weights = {name: value.numpy() for name, value in module.state_dict().items()}
+    weights = {name: widened(value.numpy()) for name, value in module.state_dict().items()}
     expected = np.stack([np.stack(run(scene, weights, 2, 1e-3)) for scene in volume.numpy()])
     found = module.states(volume).detach().numpy()
     np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12)
@@ -120,6 +126,8 @@ def test_counts_of_parameters():
 def test_arguments_are_checked(recurrence):
     with pytest.raises(OptionError, match="kernel_size must be odd; got 2"):
         recurrence(3, 2, kernel_size=2)
+    with pytest.raises(OptionError, match="state_kernel_size must be odd; got 4"):
+        recurrence(3, 2, state_kernel_size=4)
     with pytest.raises(OptionError, match="hidden_channels must be a whole number"):
         recurrence(3, 0)
     module = recurrence(3, 2)

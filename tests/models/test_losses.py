@@ -130,3 +130,45 @@ def test_arguments_are_checked():
         compute_loss(logits, given, region="edge")
     with pytest.raises(DTypeError, match="output must be a VoxelOutput or a DepthOutput"):
         compute_loss(logits.logits, given)
+
+
+def test_overlap_in_closed_form():
+    """Two steps of half-solid scenes: p of sigmoid(3) everywhere, then of sigmoid(-1)."""
+    solid = torch.zeros(1, 2, 2, 2, dtype=torch.bool)
+    solid[0, 0] = True
+    logits = torch.stack((torch.full((2, 2, 2), 3.0), torch.full((2, 2, 2), -1.0)))[None].requires_grad_()
+    given = batch(torch.ones(1, 2, dtype=torch.bool), occupancy=solid)
+    found = compute_loss(VoxelOutput(logits), given, loss="bce+iou")
+    p = torch.tensor([3.0, -1.0], dtype=torch.float64).sigmoid()
+    # 8 voxels of which 4 are solid: 4 p / (8 p + 4 - 4 p)
+    apart = (1 - p / (1 + p)).mean()
+    plain = compute_loss(VoxelOutput(logits), given)
+    torch.testing.assert_close((found - plain).detach(), (0.1 * apart).float())
+    found.backward()
+    assert bool((logits.grad[0, :, 0] < 0).all())
+
+
+def test_overlap_is_of_each_scene_and_step_that_counts():
+    """A padded step and a scene without voxels add nothing, and the sum of parts is the whole."""
+    mask = torch.tensor([[True, True], [True, False], [True, True]])
+    solid = torch.zeros(3, 1, 1, 2, dtype=torch.bool)
+    solid[:2, ..., 0] = True
+    logits = torch.arange(12.0).reshape(3, 2, 1, 1, 2) / 6
+    given = batch(mask, occupancy=solid)
+    (plain, count), (found, same) = (sum_loss(VoxelOutput(logits), given, loss=loss) for loss in ("bce", "bce+iou"))
+    p = logits.double().sigmoid()
+    iou = p[..., 0].flatten(1) / (1 + p[..., 1].flatten(1))
+    expected = 0.1 * 2 * (3 - iou[0, 0] - iou[0, 1] - iou[1, 0])
+    torch.testing.assert_close((found - plain).double(), expected, rtol=1e-5, atol=0)
+    assert float(count) == float(same) == 10
+    parts = [
+        sum_loss(VoxelOutput(logits[n : n + 1]), batch(mask[n : n + 1], occupancy=solid[n : n + 1]), loss="bce+iou")[0]
+        for n in range(3)
+    ]
+    torch.testing.assert_close(torch.stack(parts).sum(), found)
+
+
+def test_the_loss_is_checked():
+    given = batch(torch.ones(1, 1, dtype=torch.bool), occupancy=torch.ones(1, 1, 1, 1, dtype=torch.bool))
+    with pytest.raises(OptionError, match="loss must be one of 'bce', 'bce\\+iou'"):
+        compute_loss(VoxelOutput(torch.zeros(1, 1, 1, 1, 1)), given, loss="iou")

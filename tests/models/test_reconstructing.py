@@ -330,3 +330,28 @@ def test_the_command_leaves_what_the_classical_methods_leave(folder, weights, tm
     torch.testing.assert_close(first, data.open(folder).cameras.cam_from_world[1], rtol=1e-9, atol=1e-9)
     assert cli.main([*arguments[:-4], "--out", str(out)]) == 2
     assert "needs weights" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "validation", "words"),
+    [
+        (
+            "voxel-lsm",
+            {"step": 40, "measure": "iou", "by_view": [0.3, 0.21]},
+            "IoU is 21 % on the validation split at step 40",
+        ),
+        ("voxel-lsm", {"step": 40, "measure": "iou", "by_view": [0.2, 0.31]}, None),
+        ("depth-lsm", {"step": 7, "measure": "depth_error", "by_view": [0.25]}, "depth error is 0.25"),
+        ("depth-lsm", {"step": 7, "measure": "depth_error", "by_view": [0.05]}, None),
+        ("voxel-lsm", {"measure": "iou"}, None),
+        ("voxel-lsm", None, None),
+    ],
+)
+def test_a_network_that_is_barely_trained_is_warned_of(folder, tmp_path, name, validation, words):
+    about = {} if validation is None else {"validation": validation}
+    path = write_weights(tmp_path / "weights.safetensors", create(name, preset="tiny"), about=about)
+    method = {"voxel-lsm": "v-lsm", "depth-lsm": "d-lsm"}[name]
+    notes = learnt_results(data.open(folder), None, "chair", method=method, weights=path, views=2, resolution=16).notes
+    barely = [note for note in notes if "barely trained" in note]
+    assert len(barely) == (words is not None)
+    assert all(words in note for note in barely)

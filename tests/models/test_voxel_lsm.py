@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lsmgeo import VoxelGrid
+from lsmgeo import Unproject, VoxelGrid
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
 from lsmgeo.models import create
@@ -273,7 +273,47 @@ def test_finer_voxels_lie_between_the_grid_s():
     np.testing.assert_array_equal(_interleave(parts, 2)[0, 0].numpy(), expected)
 
 
+def test_a_lifted_volume_is_the_finer_one_cell_by_cell():
+    """Channel ((c l + z) l + y) l + x of a cell is channel c of its sub-voxel (z, y, x); depth and rays are its own."""
+    torch.manual_seed(0)
+    model = create("voxel-lsm", preset="tiny", lift=2, feature_channels=3, grid_size=8)
+    features, cameras = torch.randn(1, 2, 3, 16, 16), look(1, 2)[1]
+    found = model._unproject(features, cameras, None)
+    fine, _ = Unproject(VoxelGrid(16))(features, cameras)
+    rays, _ = Unproject(VoxelGrid(8), augment=("depth", "direction"))(features, cameras)
+    assert found.shape == (1, 2, 3 * 8 + 4, 8, 8, 8)
+    assert model.fusion.in_channels == 3 * 8 + 4
+    expected = np.zeros((1, 2, 3, 2, 2, 2, 8, 8, 8), np.float32)
+    for z, y, x in np.ndindex(2, 2, 2):
+        expected[:, :, :, z, y, x] = fine[..., z::2, y::2, x::2]
+    np.testing.assert_array_equal(found[:, :, :24].numpy(), expected.reshape(1, 2, 24, 8, 8, 8))
+    torch.testing.assert_close(found[:, :, 24:], rays[:, :, 3:], rtol=0, atol=0)
+
+
+def test_the_release_s_rule_takes_a_pixel_to_lie_at_j_times_the_stride():
+    """Maps whose values are their pixels' indices read u / stride there, and (u + 0.5) / stride - 0.5 by ours."""
+    rows, columns = torch.meshgrid(torch.arange(8.0), torch.arange(8.0), indexing="ij")
+    maps = torch.stack((columns, rows)).expand(1, 1, 2, 8, 8)
+    _, cameras = look(1, 1)
+    sites = VoxelGrid(8).centers().double()
+    camera = (cameras.intrinsics[0, 0].double(), cameras.cam_from_world[0, 0].double())
+    seen = (sites @ camera[1][:3, :3].T + camera[1][:3, 3]) @ camera[0].T
+    pixels = (seen[..., :2] / seen[..., 2:]).movedim(-1, 0)
+    for rules, expected in (("release", pixels / 4), ("exact", (pixels + 0.5) / 4 - 0.5)):
+        model = create("voxel-lsm", preset="tiny", feature_channels=2, feature_stride=4, pixel_rules=rules)
+        found = model._unproject(maps, cameras, None)[0, 0, :2].double()
+        inside = ((expected > 0) & (expected < 7)).all(0)
+        assert int(inside.sum()) > 100
+        torch.testing.assert_close(found[:, inside], expected[:, inside], rtol=0, atol=1e-4)
+
+
 def test_arguments_are_checked(tiny):
+    with pytest.raises(OptionError, match="input_kernel must be odd; got 2"):
+        create("voxel-lsm", preset="tiny", input_kernel=2)
+    with pytest.raises(OptionError, match="lift must be a whole number from 1 to 4; got int 5"):
+        create("voxel-lsm", preset="tiny", lift=5)
+    with pytest.raises(OptionError, match="pixel_rules must be one of 'exact', 'release'"):
+        create("voxel-lsm", preset="tiny", pixel_rules="half")
     images, cameras = look(1, 2)
     with pytest.raises(ShapeError, match=r"voxel-lsm: images must be .* multiples of 4, 8 at least; got"):
         tiny(images[..., :30], cameras)

@@ -279,3 +279,24 @@ def test_loading_weights_loads_no_other_systems():
         "assert not {'sympy', 'accelerate', 'tensorboard'} & set(sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_half_precision_takes_half_the_space_and_loads_as_float32(tmp_path, model, content):
+    path = write_weights(tmp_path / "half.safetensors", model, about={"step": 3}, half=True)
+    assert path.stat().st_size < 0.65 * len(content)
+    found, expected = load(path).state_dict(), model.state_dict()
+    for name, tensor in found.items():
+        assert tensor.dtype == torch.float32
+        torch.testing.assert_close(tensor, expected[name].half().float(), rtol=0, atol=0)
+    other = create("voxel-lsm", preset="tiny", encoder_channels=(4, 4), grid_channels=(4,), hidden_channels=4)
+    weights.fill_model(other, read_weights(path))
+    torch.testing.assert_close(other.state_dict(), found, rtol=0, atol=0)
+
+
+def test_half_precision_that_overflows_is_refused(tmp_path):
+    model = create("voxel-lsm", preset="tiny", encoder_channels=(4, 4), grid_channels=(4,), hidden_channels=4)
+    with torch.no_grad():
+        next(model.parameters()).fill_(1e6)
+    with pytest.raises(OptionError, match="not finite in float16"):
+        write_weights(tmp_path / "half.safetensors", model, half=True)
+    assert not (tmp_path / "half.safetensors").exists()

@@ -139,12 +139,6 @@ def categories_of(wanted: str | Sequence[str]) -> tuple[str, ...] | None:
 def _check_content(shards: ShardSet, need: Need) -> None:
     """Say what shards lack before the first step does."""
     first = shards.metadata(0)
-    if min(first.size) < need.image_size:
-        warnings.warn(
-            f"images of {min(first.size)} pixels are enlarged to the {need.image_size} of the model: they hold less "
-            f"than it was made for; lsmgeo render --size {need.image_size} makes them",
-            stacklevel=4,
-        )
     if need.depth and first.depth_step is None:
         raise OptionError(
             f"data: source has no depth, which the model is trained with: {shards.folder} "
@@ -155,6 +149,12 @@ def _check_content(shards: ShardSet, need: Need) -> None:
         raise OptionError(
             f"data: source has no voxels at the model's resolution {need.voxels}: {shards.folder} has {there} "
             f"(lsmgeo render --voxels {need.voxels} makes them)"
+        )
+    if min(first.size) < need.image_size:
+        warnings.warn(
+            f"images of {min(first.size)} pixels are enlarged to the {need.image_size} of the model: they hold less "
+            f"than it was made for; lsmgeo render --size {need.image_size} makes them",
+            stacklevel=4,
         )
 
 

@@ -12,7 +12,7 @@ import torch
 
 from lsmgeo.cameras import orbit, rays
 from lsmgeo.errors import OptionError
-from lsmgeo.models.evaluation import Contender, Options, Training, evaluate, write_report
+from lsmgeo.models.evaluation import Contender, Options, Training, evaluate, format_table, write_report
 from lsmgeo.models.evaluation.plane_sweeps import Swept, sweep_views
 from tests.models.evaluation.fakes import SIZE, FakeDepths, FakeShapes, FakeVoxels, iou
 
@@ -290,3 +290,34 @@ def test_a_report_is_written_whole(tmp_path):
     line = next(line for line in lines if line["row"] == "fake" and line["table"] == "views" and line["column"] == "2")
     np.testing.assert_allclose(float(line["value"]), values(report, "views", "fake")[1], rtol=1e-5)
     assert any(line["other_data"] == "1" and line["value"] == "61.5" for line in lines)
+
+
+@pytest.mark.parametrize(("width", "falls"), [(1, True), (4, False)])
+def test_the_hull_that_falls_has_a_footnote(width, falls):
+    """After four views 128 voxels are left, after five 384: slabs of 64 voxels and of 256, half of them in the 128."""
+    shapes = HalfSilhouettes((width,), ("chair",))
+    report = evaluate([Contender("fake", FakeVoxels(by_count))], shapes, "iou", Options(views=5))
+    expected = [100 * 32 * width / (128 + 32 * width), 100 * 64 * width / 384]
+    np.testing.assert_allclose(values(report, "views", "visual hull")[3:], expected, rtol=1e-12)
+    assert report.tables[0].footnote.startswith("The hull of more than three quarters falls") == falls
+    assert ("three quarters falls" in format_table(report.tables[0])) == falls
+    four = evaluate([Contender("fake", FakeVoxels(by_count))], shapes, "iou", Options(views=4))
+    assert four.tables[0].footnote == ""
+
+
+def test_enlarged_images_are_noted():
+    large = FakeVoxels(by_count)
+    large.image_size = 2 * SIZE
+    report = evaluate(
+        [Contender("large", large), Contender("fake", FakeVoxels(by_count))], slabs(), "iou", Options(views=1)
+    )
+    assert [note for note in report.notes if "enlarged" in note] == [
+        f"images of {SIZE} pixels were enlarged to the {2 * SIZE} of large: they hold less than it was made for"
+    ]
+
+
+def test_a_shape_without_voxels_counts_nowhere():
+    shapes = FakeShapes((4, 0), ("chair", "lamp"))
+    report = evaluate([Contender("fake", FakeVoxels(by_count))], shapes, "iou", Options(views=1))
+    np.testing.assert_allclose(values(report, "views", "fake"), [100 * iou(1, 4)])
+    assert math.isnan(report.shapes[1]["iou"]["fake"][0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from pathlib import Path
 
 import torch
@@ -17,8 +18,8 @@ SIZES = {"encoder_channels": (4, 4), "grid_channels": (4,), "feature_channels": 
 TRAINING, HELD_BACK = 6, 2
 
 
-def write_shapes(folder: Path) -> Path:
-    """Shards of shapes to train on and others to evaluate on, 3 views of 32 pixels each."""
+def write_shapes(folder: Path, empty: Collection[int] = ()) -> Path:
+    """Shards of shapes to train on and others to evaluate on, 3 views of 32 pixels each, some without a voxel."""
     generator = torch.Generator().manual_seed(0)
     items = []
     for number in range(TRAINING + HELD_BACK):
@@ -27,6 +28,7 @@ def write_shapes(folder: Path) -> Path:
         )
         images = torch.rand(3, 3, 32, 32, generator=generator)
         occupancy = torch.rand(16, 16, 16, generator=generator) < 0.3
+        occupancy &= number not in empty
         sample = Sample(images, cameras, None, None, occupancy, None, "chair", f"chair-{number}")
         items.append((number, encode_sample(sample, number, split="train" if number < TRAINING else "val")))
     write_shard(folder / "set-000000.tar", items, hash_settings({"made": "by a test"}))

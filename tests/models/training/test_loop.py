@@ -155,7 +155,8 @@ def test_what_a_run_leaves(shards, tmp_path):
     trained = run(config, tmp_path)
     assert (trained.step, trained.ended, trained.exit_code, trained.is_first) == (2, "steps", 0, True)
     assert trained.checkpoint == tmp_path / "checkpoints" / "step_00000002"
-    assert read_config(tmp_path / "config.json").to_dict() == config.to_dict()
+    expected = starting.decided(config, tmp_path / "none")
+    assert read_config(tmp_path / "config.json").to_dict() == expected.to_dict()
     assert [line["event"] for line in events(tmp_path)] == [
         *("start", "checkpoint", "step", "step", "evaluation", "checkpoint", "stop"),
     ]
@@ -309,3 +310,51 @@ def test_learning_rates():
     assert rates[75] == pytest.approx(2.0 * 0.5 * (1 - math.sqrt(0.5)))
     constant = OptimiserConfig(learning_rate=2.0)
     assert {optimising.learning_rate(constant, taken, None) for taken in (0, 7, 10**6)} == {2.0}
+
+
+def test_a_cosine_may_wait_until_its_end_is_known():
+    config = OptimiserConfig(learning_rate=2.0, schedule="cosine", warm_up=10)
+    known, unknown = ([optimising.learning_rate(config, t, steps, hold=30) for t in range(30)] for steps in (90, None))
+    assert known == unknown
+    assert known[9:] == [2.0] * 21
+    assert optimising.learning_rate(config, 60, 90, hold=30) == pytest.approx(1.0)
+    assert optimising.learning_rate(config, 90, 90, hold=30) == 0.0
+
+
+def test_what_is_left_to_the_trainer_is_decided_once(shards, tmp_path, monkeypatch):
+    """bf16 where the CPU has AMX; a run that goes on without keeps it."""
+    left = configure(shards, precision="auto")
+    for has_amx, expected in ((False, "no"), (True, "bf16")):
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda has_amx=has_amx: {"amx_bf16": has_amx})
+        decided = starting.decided(left, tmp_path / "none")
+        assert (decided.run.precision, decided.run.channels_last) == (expected, False)
+    run(configure(shards, steps=1, precision="auto"), tmp_path / "run")
+    assert read_config(tmp_path / "run" / "config.json").run.precision == "bf16"
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": False})
+    assert run(configure(shards, steps=2, precision="auto"), tmp_path / "run").step == 2
+    r2n2 = dataclasses.replace(left, model=ModelConfig(name="r2n2", preset="tiny"))
+    assert starting.decided(r2n2, tmp_path / "none").run.channels_last is True
+
+
+def test_weights_say_what_they_reached(shards, tmp_path):
+    run(configure(shards, steps=2, evaluate_every=1), tmp_path)
+    measured = [line["iou"] for line in events(tmp_path, "evaluation")]
+    for step, iou in enumerate(measured, 1):
+        about = load_checkpoint(tmp_path / "checkpoints" / f"step_{step:08d}").weights.about
+        assert about["validation"] == {"step": step, "measure": "iou", "by_view": [iou["1"], iou["2"]]}
+
+
+def test_shapes_without_voxels_count_in_no_mean(tmp_path):
+    folder = write_shapes(tmp_path / "shards", empty={6})
+    run(configure(folder, steps=1), tmp_path / "run")
+    (line,) = events(tmp_path / "run", "evaluation")
+    model = load(tmp_path / "run")
+    shapes = open_shapes(configure(folder).data, Need(32, 16, False), seed=3, device=CPU, is_training=False, views=2)
+    expected = []
+    for batch in validation_batches(shapes, seed=3, count=2, batch=1, device=CPU):
+        if batch.occupancy.any():
+            with torch.no_grad():
+                logits = model(batch.images, batch.cameras, batch.view_mask).logits
+            expected.append(float(voxel_iou(logits[:, 1].sigmoid(), batch.occupancy)))
+    assert len(expected) == 1
+    assert line["iou"]["2"] == pytest.approx(expected[0], rel=1e-5)

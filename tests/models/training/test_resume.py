@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import shutil
 import signal
+import time
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
 from lsmgeo.errors import CheckpointError
 from lsmgeo.models import create
-from lsmgeo.models.training import TrainingConfig, loop
+from lsmgeo.models.training import OptimiserConfig, TrainingConfig, loop, read_config
 from lsmgeo.models.training.checkpoints import load_checkpoint
 from tests.models.training.runs import SIZES, assert_same_end, configure, events, losses, run, write_shapes
 
@@ -187,3 +190,73 @@ def test_evaluations_and_checkpoints_change_nothing(shards, whole, tmp_path):
     assert_same_end(tmp_path, whole)
     assert losses(tmp_path) == losses(whole)
     assert len(events(tmp_path, "evaluation")) == 6
+
+
+# Of 32 steps, the first 30 timed at a second each: an evaluation of 4 s after every 1000th and at the end.
+CPU_MINUTES = (32 + 2 * 4 + 0.5) / 60
+
+
+@pytest.fixture(scope="module")
+def timed_config(shards) -> TrainingConfig:
+    config = configure(shards, steps=None, cpu_minutes=CPU_MINUTES, checkpoint_every=8)
+    return dataclasses.replace(config, optimiser=OptimiserConfig(learning_rate=0.01, schedule="cosine"))
+
+
+@contextlib.contextmanager
+def cpu_clock(second: float = 1.0):
+    """A clock on which a step takes a second, an evaluation of a batch 4, and nothing else any time."""
+    now = [0.0]
+
+    def takes(seconds, work):
+        def wrapped(*arguments, **options):
+            now[0] += seconds
+            return work(*arguments, **options)
+
+        return wrapped
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "time", mock.Mock(wraps=time, process_time=lambda: now[0]))
+        patch.setattr(loop, "find_gradients", takes(second, loop.find_gradients))
+        patch.setattr(loop, "evaluate_model", takes(4.0, loop.evaluate_model))
+        yield
+
+
+@pytest.fixture(scope="module")
+def timed(timed_config, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("timed")
+    with cpu_clock():
+        run(timed_config, folder)
+    return folder
+
+
+def test_cpu_minutes_become_a_number_of_steps(timed, timed_config):
+    """30 s of steps, 4 of a trial evaluation, 4 of the last one: 2.5 s are left for more."""
+    assert [line["steps"] for line in events(timed, "plan")] == [32]
+    (stop,) = events(timed, "stop")
+    assert (stop["step"], stop["reason"], stop["cpu_seconds"]) == (32, "steps", 40.0)
+    assert read_config(timed / "config.json").run.steps == 32
+    rates = {line["step"]: line["learning_rate"] for line in events(timed, "step")}
+    assert rates[30] == pytest.approx(0.01)
+    assert rates[32] == pytest.approx(0.005)
+
+
+def test_steps_that_were_planned_are_never_planned_again(timed, timed_config, tmp_path, monkeypatch):
+    """A run killed after the plan goes on bit by bit on a slower machine; so does one that is told its steps."""
+    with cpu_clock(), monkeypatch.context() as patch:
+        stop_in(patch, 31)
+        assert run(timed_config, tmp_path / "killed").step == 31
+    with cpu_clock(second=50.0):
+        run(timed_config, tmp_path / "killed")
+    assert_same_end(tmp_path / "killed", timed)
+    assert len(events(tmp_path / "killed", "plan")) == 1
+    run(read_config(timed / "config.json"), tmp_path / "told")
+    assert_same_end(tmp_path / "told", timed)
+
+
+def test_a_run_killed_while_it_is_timed_is_timed_on(timed, timed_config, tmp_path, monkeypatch):
+    with cpu_clock(), monkeypatch.context() as patch:
+        stop_in(patch, 20)
+        assert run(timed_config, tmp_path).step == 20
+    with cpu_clock():
+        run(timed_config, tmp_path)
+    assert_same_end(tmp_path, timed)

@@ -7,13 +7,14 @@ import re
 from dataclasses import MISSING, fields
 from typing import Any
 
-from benchmark_tables import RESULTS, SOURCES, list_table, load
+from benchmark_tables import CURVE, RESULTS, SOURCES, list_table, load
 from docutils import nodes
 from docutils.statemachine import StringList
 from network_tracing import Stage, traced
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
+from benchmarks.experiments import collecting, queue
 from lsmgeo.models import create
 from lsmgeo.models.presets import PRESETS, RELEASES
 from lsmgeo.models.training import config as configuration
@@ -88,23 +89,33 @@ def as_rst(text: str) -> str:
 
 def curve_rows(found: dict[str, Any]) -> list[list[str]]:
     """IoU of the last evaluation and on the test shapes, of the model and of visual hulls."""
-    measured, last = found["evaluation"], found["log"][-1]
-    views = measured["views"]
+    measured, last = found["evaluation"]["iou"], found["curve"][-1]["iou"]
+    views = range(1, 1 + len(next(iter(measured.values()))))
     rows = [["IoU, %", *(f"{view} view{'s' * (view > 1)}" for view in views)]]
-    rows += [[name, *(f"{value:.1f}" for value in values)] for name, values in measured["iou"].items()]
-    held_back = [f"{100 * last['iou'][str(view)]:.1f}" if str(view) in last["iou"] else "" for view in views]
+    rows += [[name, *(f"{value:.1f}" for value in values)] for name, values in measured.items()]
+    held_back = [f"{100 * last[str(view)]:.1f}" if str(view) in last else "" for view in views]
     return [*rows, ["in training, held back", *held_back]]
 
 
 def curve_text(found: dict[str, Any]) -> str:
     """What the curve is of."""
-    settings, last = found["settings"], found["log"][-1]
+    settings, last = found["configuration"], found["curve"][-1]
     return (
         f"{found['parameters']:,} parameters, {found['shapes']:,} shapes; {last['step']:,} steps of "
-        f"{settings['run']['batch']} shapes with {settings['data']['views']} views in {last['seconds'] / 60:.0f} "
-        f"minutes, evaluations included, on {found['machine']['device']}; the curve is of {found['held_back']} shapes "
-        f"held back, the table of {found['evaluation']['data']}."
+        f"{settings['run']['batch']} shapes in {found['cpu_minutes']['training']:.0f} CPU minutes, evaluations "
+        f"included, on {found['machine']['device']} ({found['machine']['vector_instructions']}); the curve is of "
+        f"{found['held_back']} shapes held back, the table of {found['evaluation']['data']}."
     )
+
+
+def experiment_rows(group: str) -> list[list[str]]:
+    """Every run of the queue, or of the trials, with what is known of it."""
+    rows = [["run", "what", "CPU minutes", "steps", "IoU, or median depth error"]]
+    for experiment in {"queue": queue.QUEUE, "trials": queue.TRIALS}[group]:
+        found = load(f"experiments/{experiment.name}")
+        cells = ["", "*not run*"] if found is None else [f"{found['curve'][-1]['step']:,}", collecting.headline(found)]
+        rows.append([f"``{experiment.name}``", experiment.what, f"{experiment.minutes:g}", *cells])
+    return rows
 
 
 class Rows(SphinxDirective):
@@ -144,14 +155,23 @@ class Config(Rows):
         return config_rows(self.arguments[0])
 
 
+class Experiments(Rows):
+    """``.. experiments:: queue``, or ``trials``."""
+
+    def rows(self) -> list[list[str]]:
+        for path in sorted(collecting.RESULTS.glob("*.json")):
+            self.env.note_dependency(str(path))
+        return experiment_rows(self.arguments[0])
+
+
 class Curve(SphinxDirective):
     """``.. training-curve::``: what was measured of the run whose curve is drawn."""
 
     def run(self) -> list[nodes.Node]:
-        found = load("vlsm_compact")
-        self.env.note_dependency(str(RESULTS / "vlsm_compact.json"))
+        found = load(CURVE)
+        self.env.note_dependency(str(RESULTS / f"{CURVE}.json"))
         if found is None:
-            lines = ["*Not measured yet: there is no* ``benchmarks/results/vlsm_compact.json``."]
+            lines = [f"*Not measured yet: there is no* ``benchmarks/results/{CURVE}.json``."]
         else:
             lines = [curve_text(found), "", *list_table(curve_rows(found))]
         return self.parse_text_to_nodes(StringList(lines, source=str(self.name)))
@@ -167,6 +187,7 @@ def name_fault(
 
 def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("training-curve", Curve)
+    app.add_directive("experiments", Experiments)
     app.add_role("fault", name_fault)
     app.add_directive("model-layers", Layers)
     app.add_directive("model-presets", Presets)

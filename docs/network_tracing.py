@@ -182,8 +182,8 @@ def describe(module: nn.Module) -> str:
         "Unproject": "features into the grid, with depth and ray direction",
         "PlaneSweepProject": "the grid onto planes of depth, stacked as channels",
         "ProjectReduce": "the grid onto planes of depth, with depth and ray direction, and 1x1 convolution in one",
-        "ConvGRU3d": "GRU of 3x3x3 convolutions, view after view",
-        "ConvLSTM3d": "LSTM of 3x3x3 convolutions, view after view",
+        "ConvGRU3d": f"GRU of {_sides(module)} convolutions, view after view",
+        "ConvLSTM3d": f"LSTM of {_sides(module)} convolutions, view after view",
         "_Recurrence": "GRU of 3x3x3 convolutions, view after view",
         "_Separable": "ReLU, 3x3 convolution of each channel, 1x1 convolution, norm",
         "_Rise": "ReLU, 4x4 transposed convolution, stride 2, norm",
@@ -195,10 +195,16 @@ def describe(module: nn.Module) -> str:
         has_shortcut = module.is_residual or module.shortcut is not None
         words = words if has_shortcut else words.replace(" shortcut,", "")
     if type(module).__name__ == "Unproject" and "direction" not in str(module.augment):
-        words = "features into the grid, with depth"
+        words = "features into the grid, with depth" if module.augment else "features into a finer grid"
     if getattr(module, "is_release", False):
         words = "twice the size by nearest neighbours, ReLU, 3x3 convolution, norm"
     return words
+
+
+def _sides(module: nn.Module) -> str:
+    """The kernels of a recurrence."""
+    sizes = {getattr(module, name, 3) for name in ("kernel_size", "state_kernel_size")}
+    return " and ".join(f"{size}x{size}x{size}" for size in sorted(sizes))
 
 
 def _kernel(convolution: Convolution) -> str:

@@ -47,7 +47,7 @@ def show(folder: Path) -> int:
     is_next = True
     for experiment in ALL:
         found = state(experiment, folder)
-        if found != "done" and not experiment.is_trial and is_next:
+        if found != "done" and experiment in QUEUE and is_next:
             found, is_next = f"{found}, next" if found else "next", False
         words = experiment.what
         if (kept := RESULTS / f"{experiment.name}.json").is_file():

@@ -11,7 +11,6 @@ import lsmgeo.models
 from benchmarks import timing
 from benchmarks.experiments.queue import ALL, SET, SHAPES, Experiment
 from benchmarks.experiments.running import EVALUATION, RECIPE, WEIGHTS, Folder
-from benchmarks.training_curve import read_log
 from lsmgeo.data import write_atomic
 
 __all__ = ["PRETRAINED", "RESULTS", "collect", "headline"]
@@ -49,7 +48,9 @@ def keep(experiment: Experiment, folder: Folder) -> dict[str, Any]:
     config = json.loads((path / "config.json").read_text(encoding="utf-8"))
     config["data"]["source"] = "set"  # where it lies says nothing elsewhere
     log, start = read_log(path / "log.jsonl")
-    about = {key: value for key, value in asdict(experiment).items() if key in ("what", "minutes", "ships", "is_trial")}
+    about = {
+        key: value for key, value in asdict(experiment).items() if key in ("what", "minutes", "ships", "is_tested")
+    }
     return {
         **about,
         **json.loads((path / EVALUATION).read_text(encoding="utf-8")),
@@ -58,6 +59,18 @@ def keep(experiment: Experiment, folder: Folder) -> dict[str, Any]:
         "held_back": start["held_back"],
         "curve": log,
     }
+
+
+def read_log(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """The evaluations of a log, and the line of its start. A resumed run repeats steps: the last line counts."""
+    events = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    evaluations = {
+        event["step"]: {key: event[key] for key in ("step", "iou", "depth_error", "loss") if key in event}
+        for event in events
+        if event["event"] == "evaluation"
+    }
+    start = next(event for event in events if event["event"] == "start")
+    return [evaluations[step] for step in sorted(evaluations)], start
 
 
 def headline(kept: dict[str, Any]) -> str:

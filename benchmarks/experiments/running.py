@@ -71,7 +71,7 @@ def run_experiment(experiment: Experiment, folder: Folder) -> int:
     begun = time.process_time()
     model = load(path)
     weights = _ship(experiment, model, path, folder) if experiment.ships else None
-    found = {} if experiment.is_trial else evaluate_test(weights or model, folder)
+    found = evaluate_test(weights or model, folder) if experiment.is_tested else {}
     content = {
         "set": digest,
         "machine": timing.machine("cpu"),
@@ -110,7 +110,7 @@ def hash_shapes(shards: ShardSet, indices: Sequence[int]) -> str:
     """A hash of the decoded values of shapes: pictures, depth, voxels, cameras, names; not of the files' bytes."""
     digest = hashlib.sha256()
     for index in tqdm(indices, desc="hashing the set", unit="shape", disable=None):
-        sample = shards.read(index)
+        sample = shards.read(index, occupancy=SET.voxels[0])
         digest.update(json.dumps([sample.name, sample.category, shards.splits[index]]).encode())
         for value in (sample.images, *sample.cameras, sample.depth, sample.mask, sample.occupancy):
             digest.update(np.ascontiguousarray(torch.as_tensor(value)).tobytes())

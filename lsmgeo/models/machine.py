@@ -50,7 +50,9 @@ class Machine(Model):
             self.grid, padding_mode=padding_mode, augment="depth" if is_release else ("depth", "direction")
         )
         self.lift = settings.lift
-        self.unproject_finely = Unproject(VoxelGrid(settings.grid_size * settings.lift), padding_mode=padding_mode)
+        self.unproject_finely: Unproject | None = None
+        if settings.lift > 1:
+            self.unproject_finely = Unproject(VoxelGrid(settings.grid_size * settings.lift), padding_mode=padding_mode)
         recurrence = ConvGRU3d if settings.fusion == "gru" else ConvLSTM3d
         self.fusion = recurrence(
             settings.feature_channels * settings.lift**3 + (1 if is_release else 4),
@@ -75,7 +77,7 @@ class Machine(Model):
         views = tuple(images.shape[:2])
         features, maps = self.image_encoder(images.flatten(0, 1))
         volume = self._unproject(features.unflatten(0, views), cameras, view_mask)
-        states = self.fusion.states(volume, view_mask=view_mask)[:, after]
+        states = self.fusion.states(volume, None, view_mask)[:, after]
         grids = self.grid_network(states.flatten(0, 1)).unflatten(0, states.shape[:2])
         return Seen(grids, tuple(item.unflatten(0, views) for item in maps))
 
@@ -83,7 +85,7 @@ class Machine(Model):
         """The volume (B, V, C, D, H, W) of every view: its samples, sub-voxel by sub-voxel, depth and direction."""
         if self.lift_offset:
             cameras = moved_center(self.name, cameras, self.lift_offset)
-        if self.lift == 1:
+        if self.unproject_finely is None:
             return self.unproject(features, cameras, view_mask).volume
         samples = self.unproject_finely(features, cameras, view_mask).volume
         cells = samples.unflatten(5, (-1, self.lift)).unflatten(4, (-1, self.lift)).unflatten(3, (-1, self.lift))

@@ -2,7 +2,6 @@
 
 import ast
 import inspect
-import json
 import re
 import sys
 from dataclasses import fields
@@ -11,7 +10,6 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import pytest
 
-from benchmarks import training_curve
 from lsmgeo import cli
 from lsmgeo.models import commands, create
 from lsmgeo.models.evaluation import REPORTS
@@ -143,36 +141,3 @@ def test_the_front_page_of_models_runs_and_examples_are_configurations():
     assert names["found"].by_view.shape == (1, 3, 16, 16, 16)
     for name in re.findall(r"lsmgeo train (examples/\S+\.toml)", GUIDES["training"]):
         read_config(ROOT / name)
-
-
-def test_a_curve_counts_the_time_that_a_run_takes(tmp_path):
-    """A run that was killed and resumed an hour later: the hour does not count, and a repeated step counts once."""
-
-    def line(event, time, **values):
-        return json.dumps({"event": event, "time": time, **values})
-
-    def evaluated(step, time, iou):
-        return line("evaluation", time, step=step, iou={"1": iou}, loss=0.5)
-
-    lines = [
-        line("start", 100.0, parameters=7, shapes=8, held_back=2),
-        evaluated(10, 160.0, 0.1),
-        evaluated(20, 220.0, 0.2),
-        line("resume", 3820.0),
-        evaluated(20, 3880.0, 0.3),
-    ]
-    (tmp_path / "log.jsonl").write_text("\n".join(lines) + "\n")
-    (tmp_path / "config.json").write_text(json.dumps({"data": {"source": "/somewhere/set64"}, "run": {}}))
-    row = {"name": "V-LSM", "values": [30.0], "standard_errors": [1.0], "other_data": False}
-    table = {"key": "views", "columns": ["1"], "rows": [row, {**row, "name": "paper", "other_data": True}]}
-    (tmp_path / "iou.json").write_text(
-        json.dumps({"tables": [table], "facts": {"data": "26 shapes of /somewhere/set64"}})
-    )
-    kept = training_curve.keep(tmp_path, tmp_path / "iou.json")
-    assert [(found["step"], found["seconds"], found["iou"]["1"]) for found in kept["log"]] == [
-        (10, 60.0, 0.1),
-        (20, 180.0, 0.3),
-    ]
-    assert kept["settings"]["data"]["source"] == "set64"
-    assert kept["evaluation"]["data"] == "26 shapes of set64"
-    assert kept["evaluation"]["iou"] == {"V-LSM": [30.0]}

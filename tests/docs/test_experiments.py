@@ -1,0 +1,142 @@
+"""The queue of experiments, on a set and networks that take seconds."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+
+import pytest
+import torch
+
+from benchmarks.experiments import __main__ as command
+from benchmarks.experiments import collecting, queue, running
+from benchmarks.experiments.queue import Experiment
+from lsmgeo.data import Recipe, ShardSet, render_set
+from lsmgeo.models import load
+from lsmgeo.models.training import loop
+from tests.models.training.runs import assert_same_end
+
+SET, SHAPES = Recipe(seed=0, views=2, size=32, voxels=(16,), depth=True), 65
+SMALL = {
+    "run.cpu_minutes": None, "run.steps": 4, "run.evaluate_every": 2, "run.evaluate_shapes": 4,
+    "run.checkpoint_every": 2, "run.pictures": 0, "data.views": 2,
+}  # fmt: skip
+RUNS = (
+    Experiment("first", "a V-LSM that ships", 1, "voxel-lsm", SMALL, "tiny", ships=True),
+    Experiment("second", "a D-LSM", 1, "depth-lsm", SMALL, "tiny"),
+    Experiment("third", "a trial", 1, "voxel-lsm", SMALL, "tiny", is_tested=False),
+)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    for module in (queue, running, collecting, command):
+        for name, value in {"QUEUE": RUNS[:2], "ALL": RUNS, "SET": SET, "SHAPES": SHAPES}.items():
+            if hasattr(module, name):
+                monkeypatch.setattr(module, name, value)
+    for name, value in {"RESULTS": tmp_path / "results", "PRETRAINED": tmp_path / "pretrained"}.items():
+        monkeypatch.setattr(collecting, name, value)
+    for module in (running, collecting):
+        monkeypatch.setattr(module, "RECIPE", tmp_path / "set.json")
+    monkeypatch.setattr(os, "nice", lambda more: 0)
+    monkeypatch.setattr(torch, "set_num_threads", lambda number: None)
+    return tmp_path / "experiments"
+
+
+def files(path):
+    return {one.name: one.read_bytes() for one in path.iterdir()}
+
+
+def stop_at(monkeypatch, step):
+    find, calls = loop.find_gradients, []
+
+    def find_gradients(*arguments, **options):
+        calls.append(1)
+        if len(calls) == step:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return find(*arguments, **options)
+
+    monkeypatch.setattr(loop, "find_gradients", find_gradients)
+
+
+def test_runs_follow_each_other_and_are_kept(folder, tmp_path, monkeypatch, capsys):
+    def run(*words):
+        status = command.main([*words, "--folder", str(folder)])
+        return status, capsys.readouterr().out
+
+    def states():
+        lines = run("list")[1].splitlines()
+        return {line.split()[0]: line.split("min  ")[1].split("  ")[0] for line in lines}
+
+    assert states() == {"first": "next", "second": "-", "third": "-"}
+    with monkeypatch.context() as patch:
+        stop_at(patch, 3)
+        assert run("next")[0] == 143
+    assert states() == {"first": "at step 3, next", "second": "-", "third": "-"}
+    assert run("next")[0] == 0
+    # A run that was stopped is the one that never was.
+    whole = running.Folder(tmp_path / "other")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "set").symlink_to(folder / "set")
+    assert running.run_experiment(RUNS[0], whole) == 0
+    assert_same_end(folder / "runs" / "first", whole.run(RUNS[0]))
+    assert "in half precision" in capsys.readouterr().out
+
+    assert states() == {"first": "done", "second": "next", "third": "-"}
+    assert run("next")[0] == 0
+    assert run("next", "third")[0] == 0
+    assert "all experiments are done" in run("next")[1]
+
+    assert run("collect")[0] == 0
+    kept = [files(collecting.RESULTS), files(collecting.PRETRAINED), (tmp_path / "set.json").read_bytes()]
+    assert run("collect")[0] == 0
+    assert kept == [files(collecting.RESULTS), files(collecting.PRETRAINED), (tmp_path / "set.json").read_bytes()]
+    assert sorted(kept[0]) == ["first.json", "second.json", "third.json"]
+    first, second, third = (json.loads(content) for _, content in sorted(kept[0].items()))
+    assert str(tmp_path) not in kept[0]["first.json"].decode()
+    assert [line["step"] for line in first["curve"]] == [2, 4]
+    assert len(first["evaluation"]["iou"]["voxel-lsm"]) == 2
+    assert set(first["evaluation"]["iou"]) == {"voxel-lsm", "visual hull", "visual hull, strict"}
+    assert second["evaluation"]["depth_error"]["2"]["mean"] > 0
+    assert third["evaluation"] == {}
+    assert first["set"] == json.loads(kept[2])["sha256"]
+    assert "test IoU" in run("list")[1]
+
+    assert list(kept[1]) == ["voxel-lsm-tiny.safetensors"]
+    assert str(tmp_path).encode() not in kept[1]["voxel-lsm-tiny.safetensors"]
+    shipped, trained = (
+        load(path) for path in (collecting.PRETRAINED / "voxel-lsm-tiny.safetensors", folder / "runs" / "first")
+    )
+    for name, tensor in shipped.state_dict().items():
+        torch.testing.assert_close(tensor, trained.state_dict()[name], rtol=1e-3, atol=1e-6)
+    # Results that are in the repository are done wherever the run was made.
+    assert command.main(["next", "--folder", str(tmp_path / "nowhere")]) == 0
+    with pytest.raises(SystemExit, match="there is no experiment 'fourth'; there are first, second, third"):
+        command.main(["next", "fourth", "--folder", str(folder)])
+
+
+def test_the_hash_is_of_values_not_of_files(tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "SET", SET)
+    sets = []
+    for name, per_shard, seed in (("one", 3, 0), ("two", 4, 0), ("three", 4, 1)):
+        render_set("synthetic-13", tmp_path / name, SET._replace(seed=seed), shapes=6, per_shard=per_shard, jobs=1)
+        sets.append(ShardSet(tmp_path / name))
+    one, two, three = (running.hash_shapes(shards, range(6)) for shards in sets)
+    assert one == two != three
+
+
+def test_the_queue_trains_for_its_minutes_and_tells_what_differs():
+    for experiment in queue.ALL:
+        config = experiment.config("set")
+        kept = queue.EVALUATION_MINUTES[experiment.output] if experiment.is_tested else 0
+        assert config.run.cpu_minutes == experiment.minutes - kept > 0
+        assert experiment.minutes <= 90
+        assert config.data.workers == 0
+    names = [experiment.name for experiment in queue.ALL]
+    assert len(set(names)) == len(names)
+    assert [one.name for one in queue.QUEUE if one.ships] == ["vlsm_90", "dlsm_90"]
+    noise, background = queue.find("vlsm_noise_45").config("set").data, queue.find("vlsm_bg_45").config("set").data
+    assert (noise.pose_noise, background.background) == (10.0, "random")
+    rules = queue.find("vlsm_release_rules_45").config("set").model
+    assert rules.settings == {"pixel_rules": "release"}

@@ -121,7 +121,7 @@ BEFORE = {
     "state_kernel": 3,
 }
 
-MORE = ["none", "convolution", "convolution", "convolution", "identity", "identity"]
+MORE = ["none", "convolution", "convolution", "convolution", "convolution", "identity"]
 
 # What settings were chosen by, on the validation split; run by name.
 TRIALS = tuple(
@@ -144,7 +144,6 @@ TRIALS = tuple(
         Experiment("dlsm_10", "D-LSM", 10, "depth-lsm"),
         Experiment("r2n2_pose_8", "3D-R2N2 with pose", 8, "r2n2-pose"),
         Experiment("r2n2_pose_slow_8", "3D-R2N2 with pose, 3e-4", 8, "r2n2-pose", {"optimiser.learning_rate": 3e-4}),
-        Experiment("r2n2_pose_fast_8", "3D-R2N2 with pose, 2e-3", 8, "r2n2-pose", {"optimiser.learning_rate": 2e-3}),
         Experiment(
             "r2n2_pose_every_8",
             "3D-R2N2 with pose, the loss after every view",
@@ -153,11 +152,11 @@ TRIALS = tuple(
             {"run.loss_views": "every"},
         ),
         Experiment(
-            "r2n2_pose_more_channels_8",
-            "3D-R2N2 with pose, twice the channels",
+            "r2n2_pose_128_8",
+            "3D-R2N2 with pose, images of 128 pixels",
             8,
             "r2n2-pose",
-            {"model.settings": {"channels": [32, 64, 96, 128, 128, 128], "shortcuts": MORE, "hidden": 96}},
+            {"model.settings": {"image_size": 128, "channels": [16, 32, 64, 96, 128, 128], "shortcuts": MORE}},
         ),
     )
 )

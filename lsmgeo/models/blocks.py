@@ -10,7 +10,7 @@ from torch.nn.functional import conv2d, conv3d, conv_transpose2d, conv_transpose
 
 from lsmgeo._checks import check_choice
 
-__all__ = ["Block", "Convolution", "InstanceNorm"]
+__all__ = ["Block", "Convolution", "InstanceNorm", "interleave"]
 
 NORMS = ("scale", "shift", "none")
 
@@ -159,3 +159,18 @@ class Block(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map (N, C, ...) to (N, C', ...)."""
         return self.norm(self.convolution(x.relu() if self.activate else x))
+
+
+def interleave(parts: Tensor, factor: int) -> Tensor:
+    """Channels as the voxels of a finer grid.
+
+    Args:
+        parts: (N, factor^3, D, H, W), z slowest.
+        factor: how much finer.
+
+    Returns:
+        (N, 1, factor D, factor H, factor W).
+    """
+    x = parts.unflatten(1, (factor, factor, factor))  # (N, z, y, x, D, H, W)
+    x = x.permute(0, 4, 1, 5, 2, 6, 3)
+    return x.flatten(5, 6).flatten(3, 4).flatten(1, 2)[:, None]

@@ -44,13 +44,14 @@ _TINY: dict[str, Any] = {
     "grid_skip": True,
 }
 _COMPACT_R2N2: dict[str, Any] = {
-    "image_size": 128,
-    "channels": (16, 32, 64, 96, 128, 128),
-    "shortcuts": ("none", "convolution", "convolution", "convolution", "convolution", "identity"),
+    "image_size": 64,
+    "channels": (24, 48, 96, 128, 128),
+    "shortcuts": ("none", "convolution", "convolution", "convolution", "identity"),
     "features": 256,
     "pose_features": 64,
     "hidden": 64,
-    "decoder": (64, 32, 16, 8),
+    "decoder": (64, 32, 16),
+    "upsample": 2,
 }
 _TINY_R2N2: dict[str, Any] = {
     "image_size": 32,

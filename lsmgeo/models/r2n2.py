@@ -17,6 +17,7 @@ from lsmgeo._checks import check_choice, check_devices, check_flag, check_float,
 from lsmgeo.cameras.tensors import Cameras, as_tensors, check_cameras
 from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.grids import VoxelGrid
+from lsmgeo.models.blocks import interleave
 from lsmgeo.models.machine import evaluating
 from lsmgeo.models.model import Model
 from lsmgeo.models.outputs import VoxelOutput, VoxelResult, chosen_steps
@@ -41,6 +42,7 @@ class R2N2Settings:
         coarse: voxels along a side of the recurrence's grid.
         hidden: its channels.
         decoder: channels of the blocks after it; each but the last doubles the grid.
+        upsample: voxels of the occupancy along a side of one of the last block's: a cheap way to a finer output.
     """
 
     pose: bool = False
@@ -52,11 +54,12 @@ class R2N2Settings:
     coarse: int = 4
     hidden: int = 128
     decoder: tuple[int, ...] = (128, 128, 64, 32)
+    upsample: int = 1
 
     @property
     def resolution(self) -> int:
         """Voxels along a side of the output."""
-        return self.coarse << (len(self.decoder) - 1)
+        return (self.coarse << (len(self.decoder) - 1)) * self.upsample
 
     def check(self, who: str) -> None:
         """Raise an `OptionError` that names the first impossible setting."""
@@ -64,6 +67,7 @@ class R2N2Settings:
         for name, most in (("image_size", 4096), ("features", 1 << 16), ("pose_features", 1 << 16), ("coarse", 64)):
             check_whole(who, name, getattr(self, name), 1, most)
         check_whole(who, "hidden", self.hidden, 1, 4096)
+        check_whole(who, "upsample", self.upsample, 1, 4)
         check_channels(who, "channels", self.channels)
         check_channels(who, "decoder", self.decoder)
         if len(self.decoder) < 2:
@@ -126,18 +130,19 @@ class _GridBlock(nn.Module):
 class _LastBlock(nn.Module):
     """Three convolutions of 3 voxels, the second and third of the first's answer and added, then one to two classes."""
 
-    def __init__(self, before: int, channels: int) -> None:
+    def __init__(self, before: int, channels: int, upsample: int) -> None:
         super().__init__()
+        self.upsample = upsample
         self.first = nn.Conv3d(before, channels, 3, padding=1)
         self.second = nn.Conv3d(channels, channels, 3, padding=1)
         self.shortcut = nn.Conv3d(channels, channels, 3, padding=1)
-        self.classes = nn.Conv3d(channels, 2, 3, padding=1)
+        self.classes = nn.Conv3d(channels, 2 * upsample**3, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
         y = leaky_relu(self.first(x))
-        empty, solid = self.classes(leaky_relu(self.second(y)) + self.shortcut(y)).unbind(1)
+        empty, solid = self.classes(leaky_relu(self.second(y)) + self.shortcut(y)).chunk(2, 1)
         # The softmax of two classes is the sigmoid of their difference.
-        return solid - empty
+        return interleave(solid - empty, self.upsample)[:, 0]
 
 
 class _Recurrence(nn.Module):
@@ -232,7 +237,8 @@ class R2N2(Model):
         self.recurrence = _Recurrence(read, settings.hidden, settings.coarse)
         widths = (settings.hidden, *settings.decoder)
         grids = [_GridBlock(*pair) for pair in pairwise(widths[:-1])]
-        self.decoder = nn.Sequential(*grids, _LastBlock(*widths[-2:])).apply(_initialise)
+        last = _LastBlock(widths[-2], widths[-1], settings.upsample)
+        self.decoder = nn.Sequential(*grids, last).apply(_initialise)
 
     def forward(
         self,

@@ -10,7 +10,7 @@ from torch import Tensor
 from lsmgeo._checks import check_flag
 from lsmgeo.cameras.tensors import Cameras
 from lsmgeo.grids import VoxelGrid
-from lsmgeo.models.blocks import Block
+from lsmgeo.models.blocks import Block, interleave
 from lsmgeo.models.machine import Machine, evaluating
 from lsmgeo.models.outputs import VoxelOutput, VoxelResult
 from lsmgeo.models.settings import VoxelSettings, changed
@@ -97,7 +97,7 @@ class VoxelLSM(Machine):
         grids, _ = self.see(images, cameras, view_mask, steps)
         logits = self.out(grids.flatten(0, 1))
         if self.settings.upsample > 1:
-            logits = _interleave(logits, self.settings.upsample)
+            logits = interleave(logits, self.settings.upsample)
         return VoxelOutput(logits.squeeze(1).unflatten(0, grids.shape[:2]))
 
     def run(
@@ -122,10 +122,3 @@ class VoxelLSM(Machine):
             logits = self(images, cameras, view_mask, steps=None if by_view else "last").logits
             occupancy = logits.float().sigmoid()
         return VoxelResult(occupancy[:, -1], occupancy if by_view else None)
-
-
-def _interleave(parts: Tensor, factor: int) -> Tensor:
-    """Channels (N, factor^3, D, H, W) as the voxels of a finer grid, (N, 1, factor D, factor H, factor W)."""
-    x = parts.unflatten(1, (factor, factor, factor))  # (N, z, y, x, D, H, W)
-    x = x.permute(0, 4, 1, 5, 2, 6, 3)
-    return x.flatten(5, 6).flatten(3, 4).flatten(1, 2)[:, None]

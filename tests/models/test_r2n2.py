@@ -170,7 +170,9 @@ def test_parameters_by_hand():
             assert count(create(name, preset="tiny")) < 60_000
 
 
-@pytest.mark.parametrize(("preset", "sizes"), [("tiny", (32, 16)), ("compact", (128, 32)), ("paper", (224, 32))])
+@pytest.mark.parametrize(
+    ("preset", "sizes"), [("tiny", (32, 16)), ("compact", (64, 32)), ("standard", (64, 32)), ("paper", (224, 32))]
+)
 def test_presets_have_their_sizes(preset, sizes):
     for name in ("r2n2", "r2n2-pose"):
         with torch.device("meta"):

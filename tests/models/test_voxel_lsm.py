@@ -10,7 +10,7 @@ from lsmgeo import Unproject, VoxelGrid
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
 from lsmgeo.models import create
-from lsmgeo.models.voxel_lsm import _interleave
+from lsmgeo.models.blocks import interleave
 from tests.models.inputs import look, some
 from tests.models.released_layers import encode, occupy, reason
 from tests.tolerances import BATCHED
@@ -270,7 +270,7 @@ def test_finer_voxels_lie_between_the_grid_s():
     expected = np.zeros((4, 2, 2))
     for z, y, x in np.ndindex(4, 2, 2):
         expected[z, y, x] = 10 * (z // 2) + 4 * (z % 2) + 2 * y + x
-    np.testing.assert_array_equal(_interleave(parts, 2)[0, 0].numpy(), expected)
+    np.testing.assert_array_equal(interleave(parts, 2)[0, 0].numpy(), expected)
 
 
 def test_a_lifted_volume_is_the_finer_one_cell_by_cell():

@@ -9,7 +9,7 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from math import ceil
+from math import ceil, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -237,14 +237,15 @@ def _train(
         ) as some:
             return evaluate_model(model, some, stop, region=run.region, loss=run.loss, pictures=pictures)
 
-    def planned(minutes: float, timed: Sequence[float]) -> int:
+    def planned(timed: Sequence[float]) -> int:
         """The number of steps that fill the CPU minutes, by the time of a step and of an evaluation."""
+        assert run.cpu_minutes is not None
         step_seconds = sum(timed) / len(timed)
         begun = time.process_time()
         measure(run.batch * processes, 0)
         batches_of_all = ceil(min(run.evaluate_shapes, len(held_back)) / (run.batch * processes))
         evaluation_seconds = (time.process_time() - begun) * batches_of_all
-        left = 60 * minutes - (time.process_time() - cpu_begin) - evaluation_seconds
+        left = 60 * run.cpu_minutes - (time.process_time() - cpu_begin) - evaluation_seconds
         more = int(left / (step_seconds + evaluation_seconds / run.evaluate_every))
         return gather(place.step + max(1, more))[0]
 
@@ -281,7 +282,7 @@ def _train(
                     place.measured = {
                         "step": place.step,
                         "measure": found.measure,
-                        "by_view": [*found.by_view.values()],
+                        "by_view": [value if isfinite(value) else None for value in found.by_view.values()],
                     }
                     # Whatever was saved of this step does not know of it.
                     saved_step = None
@@ -289,15 +290,17 @@ def _train(
                         place.best, place.best_value = place.step, found.value
                     log.evaluation(place.step, found, seconds=time.monotonic() - begun, best=place.best)
 
-            if run.steps is None and run.cpu_minutes is not None and place.step >= TIMED_STEPS and not ended:
-                steps = planned(run.cpu_minutes, timed[SLOW_STEPS:] or timed)
+            is_timed = len(timed) > 0 and place.step >= TIMED_STEPS
+            plans = is_timed and run.cpu_minutes is not None and run.steps is None and not ended
+            if plans:
+                steps = planned(timed[SLOW_STEPS:] or timed)
                 run = replace(run, steps=steps)
                 config = replace(config, run=run)
                 if rank == 0:
                     write_atomic(folder / CONFIG, json.dumps(config.to_dict(), indent=1).encode())
                 log.plan(steps)
-                saved_step = None
-            is_due = ended or place.step % run.checkpoint_every == 0 or place.step in (place.best, TIMED_STEPS)
+                saved_step = None  # whatever was saved of this step does not know of it
+            is_due = ended or plans or place.step % run.checkpoint_every == 0 or place.step == place.best
             if is_due and place.step != saved_step:
                 # The first tells before the work whether the folder can be written.
                 save(must=bool(ended) or place.step == 0)

@@ -41,7 +41,7 @@ def decided(config: TrainingConfig, folder: Path) -> TrainingConfig:
             checkpoint = load_latest(folder)
     except CheckpointError:
         checkpoint = None
-    before = {} if checkpoint is None else checkpoint.config["run"]
+    before = {} if checkpoint is None else checkpoint.config.get("run", {})
     model: Any = MODELS.get(config.model.name)
     choices: dict[str, Any] = {}
     if run.precision == "auto":
@@ -56,8 +56,7 @@ def decided(config: TrainingConfig, folder: Path) -> TrainingConfig:
 def fast_precision(device: str) -> str:
     """The precision in which the hardware multiplies fastest: "bf16" or "no".
 
-    Without units for it a CPU is slower: a step of the compact V-LSM took 1.5 times as long on one that only has
-    AVX-512.
+    A CPU without units for bfloat16 is slower in it than in float32 (docs/experiments).
 
     Args:
         device: "auto" or "cpu".

@@ -33,7 +33,7 @@ TABLES: dict[str, Callable[[list[dict[str, Any]]], report.Rows]] = {
     "models": report.model_rows,
 }
 # The run whose curve of training is drawn.
-CURVE = "experiments/vlsm_tested_36"
+CURVE = "experiments/vlsm_45"
 # Figures of the plot directive, and the results that they draw.
 PLOTS = {"benchmark_growth": "growth", "classical_density": "classical", "training_curve": CURVE}
 # What the drawings and tables of the models are made from.

@@ -110,10 +110,13 @@ def curve_text(found: dict[str, Any]) -> str:
 
 def experiment_rows(group: str) -> list[list[str]]:
     """Every run of the queue, or of the trials, with what is known of it."""
-    rows = [["run", "what", "CPU minutes", "steps", "IoU, or median depth error"]]
+    rows = [["run", "what", "CPU minutes", "training took", "steps", "IoU, or median depth error"]]
     for experiment in {"queue": queue.QUEUE, "trials": queue.TRIALS}[group]:
         found = load(f"experiments/{experiment.name}")
-        cells = ["", "*not run*"] if found is None else [f"{found['curve'][-1]['step']:,}", collecting.headline(found)]
+        cells = ["", "", "*not run*"]
+        if found is not None:
+            took = f"{found['cpu_minutes']['training']:.1f}"
+            cells = [took, f"{found['curve'][-1]['step']:,}", collecting.headline(found)]
         rows.append([f"``{experiment.name}``", experiment.what, f"{experiment.minutes:g}", *cells])
     return rows
 
@@ -159,8 +162,8 @@ class Experiments(Rows):
     """``.. experiments:: queue``, or ``trials``."""
 
     def rows(self) -> list[list[str]]:
-        for path in sorted(collecting.RESULTS.glob("*.json")):
-            self.env.note_dependency(str(path))
+        for experiment in queue.ALL:
+            self.env.note_dependency(str(RESULTS / "experiments" / f"{experiment.name}.json"))
         return experiment_rows(self.arguments[0])
 
 

@@ -4,8 +4,8 @@ Everything is rendered here: no data are needed. Run from the root of the reposi
 
     python examples/train_vlsm.py runs/vlsm_example
 
-It takes a minute or two, and the shapes it makes are blobs: good ones take an hour (examples/configs/vlsm_compact.toml)
-and more. Run again, it goes on where it was.
+It takes a minute or two, and the shapes it makes are blobs: good ones take half an hour
+(examples/configs/vlsm_compact.toml) and more. Run again, it goes on where it was.
 """
 
 import sys

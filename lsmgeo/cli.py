@@ -322,8 +322,8 @@ def _plain(words: Sequence[str], commands: Iterable[Callable[..., object]]) -> l
     parameters = (parameter for command in commands for parameter in signature(command).parameters.values())
     flags = "|".join(sorted({parameter.name for parameter in parameters if parameter.annotation == "bool"}))
     text = "\0".join(words)
-    text = re.sub(rf"(?<![^\0])--({flags})[=\0](true|yes)(?![^\0])", r"--\1", text)
-    text = re.sub(rf"(?<![^\0])--({flags})[=\0](false|no)(?![^\0])", r"--no_\1", text)
+    text = re.sub(rf"(?<![^\0])--({flags})[=\0](?i:true|yes)(?![^\0])", r"--\1", text)
+    text = re.sub(rf"(?<![^\0])--({flags})[=\0](?i:false|no)(?![^\0])", r"--no_\1", text)
     # jsonargparse appends to a list with "+"; that an option is given again and again is how others do it.
     return re.sub(r"(?<![^\0])--set(?![^=\0])", "--set+", text).split("\0") if words else []
 

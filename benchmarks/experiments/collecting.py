@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -63,9 +65,12 @@ def keep(experiment: Experiment, folder: Folder) -> dict[str, Any]:
 
 def read_log(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """The evaluations of a log, and the line of its start. A resumed run repeats steps: the last line counts."""
-    events = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    events = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        with contextlib.suppress(json.JSONDecodeError):  # a loss of power leaves half a line
+            events.append(json.loads(line))
     evaluations = {
-        event["step"]: {key: event[key] for key in ("step", "iou", "depth_error", "loss") if key in event}
+        event["step"]: {key: number(event[key]) for key in ("step", "iou", "depth_error", "loss") if key in event}
         for event in events
         if event["event"] == "evaluation"
     }
@@ -73,19 +78,26 @@ def read_log(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     return [evaluations[step] for step in sorted(evaluations)], start
 
 
+def number(value: Any) -> Any:
+    """A number of the log, or a mapping of such; None for what was not finite, which the log has as text."""
+    if isinstance(value, dict):
+        return {key: number(item) for key, item in value.items()}
+    return None if isinstance(value, str) else value
+
+
 def headline(kept: dict[str, Any]) -> str:
     """The result of a run in a few words: its measure by the number of views."""
-    last = kept["curve"][-1]
-    found = kept["evaluation"]
+    found, last = kept["evaluation"], kept["curve"][-1]
     if "iou" in found:
-        values = next(iter(found["iou"].values()))
-        return "test IoU " + " ".join(f"{value:.1f}" for value in values)
+        return "test IoU " + shown(next(iter(found["iou"].values())))
     if "depth_error" in found:
-        return "test depth error " + ", ".join(
-            f"{views} views {one['mean']:.4f}" for views, one in found["depth_error"].items()
-        )
-    measure = "iou" if "iou" in last else "depth_error"
-    factor = 100 if measure == "iou" else 1
-    digits = 1 if measure == "iou" else 4
-    values = " ".join(f"{factor * value:.{digits}f}" for value in last[measure].values())
-    return f"validation {measure.replace('_', ' ')} {values}"
+        errors = {views: one["mean"] for views, one in found["depth_error"].items()}
+        return f"test depth error {shown(errors.values(), 4)} ({', '.join(errors)} views)"
+    if "iou" in last:
+        return "validation IoU " + shown(None if value is None else 100 * value for value in last["iou"].values())
+    return "validation depth error " + shown(last["depth_error"].values(), 4)
+
+
+def shown(values: Iterable[float | None], digits: int = 1) -> str:
+    """Numbers with spaces between."""
+    return " ".join("-" if value is None else f"{value:.{digits}f}" for value in values)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,8 @@ __all__ = ["ALL", "EVALUATION_MINUTES", "QUEUE", "SET", "SHAPES", "Experiment", 
 # The set of all runs; `set.json` beside this file holds the hash of its values.
 SET = Recipe(seed=0, views=8, size=128, voxels=(32,), depth=True, shadows=False)
 SHAPES = 12_000
-# What is kept of a run's minutes for the evaluation of its weights.
-EVALUATION_MINUTES = {"voxels": 6.0, "depth": 8.0}
+# What the evaluation of a network takes of its minutes, and what further reports take.
+EVALUATION_MINUTES = {"voxels": 6.0, "depth": 8.0, "backgrounds": 1.5, "pose-noise": 3.0, "order": 5.0}
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,7 @@ class Experiment:
         model: the network, as `lsmgeo.models.create` knows it.
         settings: what differs from the network's usual training, as "group.key".
         preset: of the network.
+        reports: what else it is measured by, see ``lsmgeo evaluate``, on fewer test shapes.
         ships: whether its weights become part of the package.
         is_tested: whether its weights are measured on the test split; else only training measures them, on the
             validation split.
@@ -42,6 +43,7 @@ class Experiment:
     model: str
     settings: Mapping[str, Any] = field(default_factory=dict)
     preset: str = "standard"
+    reports: Sequence[str] = ()
     ships: bool = False
     is_tested: bool = True
 
@@ -49,6 +51,13 @@ class Experiment:
     def output(self) -> str:
         """What the network gives: "voxels" or "depth"."""
         return "depth" if self.model == "depth-lsm" else "voxels"
+
+    @property
+    def evaluation_minutes(self) -> float:
+        """What is kept of the minutes for the evaluation of the weights."""
+        if not self.is_tested:
+            return 0.0
+        return EVALUATION_MINUTES[self.output] + sum(EVALUATION_MINUTES[report] for report in self.reports)
 
     def config(self, folder: Path) -> TrainingConfig:
         """The configuration of its training.
@@ -61,7 +70,7 @@ class Experiment:
             "data": {"source": str(folder), "views": 4, "workers": 0},
             "optimiser": {"schedule": "cosine", "warm_up": 100, "clip_norm": 1.0},
             "run": {
-                "cpu_minutes": self.minutes - (EVALUATION_MINUTES[self.output] if self.is_tested else 0),
+                "cpu_minutes": self.minutes - self.evaluation_minutes,
                 "batch": 4,
                 "device": "cpu",
                 "precision": "auto",
@@ -82,28 +91,37 @@ class Experiment:
 USUAL: Mapping[str, Mapping[str, Any]] = {
     "voxel-lsm": {"optimiser.learning_rate": 2e-3, "run.loss_views": "random"},
     "depth-lsm": {"optimiser.learning_rate": 2e-3, "run.loss_views": "last"},
-    "r2n2": {"optimiser.learning_rate": 1e-3, "run.loss_views": "random"},
-    "r2n2-pose": {"optimiser.learning_rate": 1e-3, "run.loss_views": "random"},
+    "r2n2": {"optimiser.learning_rate": 3e-4, "run.loss_views": "random"},
+    "r2n2-pose": {"optimiser.learning_rate": 3e-4, "run.loss_views": "random"},
 }
 
 FIRST, SECOND = {"data.categories": "first"}, {"data.categories": "second"}
 
 QUEUE = (
-    Experiment("vlsm_45", "V-LSM", 45, "voxel-lsm"),
+    Experiment("vlsm_45", "V-LSM", 45, "voxel-lsm", reports=("backgrounds", "pose-noise")),
     Experiment("r2n2_pose_45", "3D-R2N2 with pose", 45, "r2n2-pose"),
     Experiment("dlsm_45", "D-LSM", 45, "depth-lsm"),
-    Experiment("vlsm_90", "V-LSM, the weights of the package", 90, "voxel-lsm", ships=True),
+    Experiment("vlsm_90", "V-LSM, the weights of the package", 90, "voxel-lsm", reports=("order",), ships=True),
     Experiment("dlsm_90", "D-LSM, the weights of the package", 90, "depth-lsm", ships=True),
     Experiment("r2n2_45", "3D-R2N2", 45, "r2n2"),
-    Experiment("vlsm_bg_45", "V-LSM on random backgrounds", 45, "voxel-lsm", {"data.background": "random"}),
-    Experiment("vlsm_noise_45", "V-LSM with pose noise", 45, "voxel-lsm", {"data.pose_noise": 10.0}),
+    Experiment(
+        "vlsm_bg_45",
+        "V-LSM on random backgrounds",
+        45,
+        "voxel-lsm",
+        {"data.background": "random"},
+        reports=("backgrounds",),
+    ),
+    Experiment(
+        "vlsm_noise_45", "V-LSM with pose noise", 45, "voxel-lsm", {"data.pose_noise": 10.0}, reports=("pose-noise",)
+    ),
     Experiment("vlsm_first_45", "V-LSM on the first categories", 45, "voxel-lsm", FIRST),
     Experiment("vlsm_second_45", "V-LSM on the second categories", 45, "voxel-lsm", SECOND),
     Experiment("r2n2_pose_first_45", "3D-R2N2 with pose on the first categories", 45, "r2n2-pose", FIRST),
     Experiment("r2n2_pose_second_45", "3D-R2N2 with pose on the second categories", 45, "r2n2-pose", SECOND),
     Experiment(
         "vlsm_release_rules_45",
-        "V-LSM with the release's three pixel rules: what right geometry buys",
+        "V-LSM with the release's rule of pixels, 1.5 pixels aside: what right geometry buys",
         45,
         "voxel-lsm",
         {"model.settings": {"pixel_rules": "release"}},
@@ -121,11 +139,9 @@ BEFORE = {
     "state_kernel": 3,
 }
 
-MORE = ["none", "convolution", "convolution", "convolution", "convolution", "identity"]
-
 # What settings were chosen by, on the validation split; run by name.
 TRIALS = tuple(
-    replace(trial, is_tested="tested" in trial.name, preset="standard" if "wide" in trial.name else "compact")
+    replace(trial, is_tested=False, preset="standard" if "wide" in trial.name else "compact")
     for trial in (
         Experiment(
             "vlsm_before_5",
@@ -135,15 +151,20 @@ TRIALS = tuple(
             {"model.settings": BEFORE, "run.loss": "bce", "run.loss_views": "every"},
         ),
         Experiment("vlsm_every_5", "V-LSM, the loss after every view", 5, "voxel-lsm", {"run.loss_views": "every"}),
-        Experiment("vlsm_bf16_5", "V-LSM in bfloat16", 5, "voxel-lsm", {"run.precision": "bf16"}),
+        Experiment(
+            "vlsm_bf16_5",
+            "V-LSM in bfloat16, ten steps",
+            5,
+            "voxel-lsm",
+            {"run.precision": "bf16", "run.cpu_minutes": None, "run.steps": 10, "run.evaluate_shapes": 4},
+        ),
         Experiment("vlsm_5", "V-LSM", 5, "voxel-lsm"),
         Experiment("vlsm_20", "V-LSM", 20, "voxel-lsm"),
-        Experiment("vlsm_tested_36", "V-LSM for 30 minutes, and 6 for the test split", 36, "voxel-lsm"),
         Experiment("vlsm_wide_20", "V-LSM, wider", 20, "voxel-lsm"),
         Experiment("dlsm_before_10", "D-LSM as it was before, in float32", 10, "depth-lsm", {"model.settings": BEFORE}),
         Experiment("dlsm_10", "D-LSM", 10, "depth-lsm"),
         Experiment("r2n2_pose_8", "3D-R2N2 with pose", 8, "r2n2-pose"),
-        Experiment("r2n2_pose_slow_8", "3D-R2N2 with pose, 3e-4", 8, "r2n2-pose", {"optimiser.learning_rate": 3e-4}),
+        Experiment("r2n2_pose_fast_8", "3D-R2N2 with pose, 1e-3", 8, "r2n2-pose", {"optimiser.learning_rate": 1e-3}),
         Experiment(
             "r2n2_pose_every_8",
             "3D-R2N2 with pose, the loss after every view",
@@ -152,12 +173,13 @@ TRIALS = tuple(
             {"run.loss_views": "every"},
         ),
         Experiment(
-            "r2n2_pose_128_8",
-            "3D-R2N2 with pose, images of 128 pixels",
+            "r2n2_pose_channels_8",
+            "3D-R2N2 with pose, more channels",
             8,
             "r2n2-pose",
-            {"model.settings": {"image_size": 128, "channels": [16, 32, 64, 96, 128, 128], "shortcuts": MORE}},
+            {"model.settings": {"channels": [32, 64, 128, 192, 192], "hidden": 96, "decoder": [96, 48, 24]}},
         ),
+        Experiment("r2n2_pose_16", "3D-R2N2 with pose, twice as long", 16, "r2n2-pose"),
     )
 )
 

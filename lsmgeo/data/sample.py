@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import default_collate
 
-from lsmgeo._checks import check_devices, check_float, check_mask, describe
+from lsmgeo._checks import check_devices, check_float, check_mask, check_whole, describe
 from lsmgeo.cameras import CameraTensors, as_tensors
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import DTypeError, ShapeError
@@ -77,15 +77,27 @@ class Batch(NamedTuple):
         """The same shapes with their first views only.
 
         Args:
-            views: how many, at least 1.
+            views: how many, at least 1; all where there are fewer.
+
+        Returns:
+            A batch of min(views, V) views, whose tensors are views of this one's.
+
+        Raises:
+            OptionError: no such number.
         """
+        check_whole("Batch", "views", views, 1)
         return self._replace(
             images=self.images[:, :views],
-            cameras=CameraTensors(*(torch.as_tensor(field)[:, :views] for field in self.cameras)),
+            cameras=first_views(self.cameras, views),
             depth=None if self.depth is None else self.depth[:, :views],
             mask=None if self.mask is None else self.mask[:, :views],
             view_mask=self.view_mask[:, :views],
         )
+
+
+def first_views(cameras: CameraTensors, views: int) -> CameraTensors:
+    """The first views of cameras with the leading shape (B, V)."""
+    return CameraTensors(*(torch.as_tensor(field)[:, :views] for field in cameras))
 
 
 def check_sample(sample: Sample, who: str = "sample") -> CameraTensors:

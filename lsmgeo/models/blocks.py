@@ -170,6 +170,9 @@ def interleave(parts: Tensor, factor: int) -> Tensor:
 
     Returns:
         (N, 1, factor D, factor H, factor W).
+
+    Raises:
+        RuntimeError: another number of channels.
     """
     x = parts.unflatten(1, (factor, factor, factor))  # (N, z, y, x, D, H, W)
     x = x.permute(0, 4, 1, 5, 2, 6, 3)

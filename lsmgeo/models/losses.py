@@ -91,7 +91,7 @@ def sum_loss(
         # Of a shape without voxels the overlap is 0 whatever is predicted.
         is_counted = is_told & truth.flatten(1).any(1, keepdim=True)
         apart = torch.where(is_counted, 1 - _soft_iou(predicted, target), 0.0)
-        total = total + IOU_WEIGHT * truth[0].numel() * apart.sum()
+        total = total + IOU_WEIGHT * truth.shape[1:].numel() * apart.sum()
     return total, weight.expand(terms.shape).sum()
 
 

@@ -39,13 +39,12 @@ class Machine(Model):
         is_release = settings.variant == "release"
         self.image_size = settings.image_size
         # The release takes pixel j of a map at j times its stride: the camera's image lies aside by so many pixels.
-        has_release_rules = settings.pixel_rules == "release"
-        self.lift_offset = (settings.feature_stride - 1) / 2 if has_release_rules else 0.0
+        self.lift_offset = (settings.feature_stride - 1) / 2 if settings.pixel_rules == "release" else 0.0
         self.resolution = settings.grid_size
         self.grid = VoxelGrid(settings.grid_size)
         self.image_encoder = ImageEncoder(settings)
         # "zeros": what lies outside an image is told apart from what looks like its border; the release smears that.
-        padding_mode = "border" if is_release or has_release_rules else "zeros"
+        padding_mode = "border" if is_release else "zeros"
         self.unproject = Unproject(
             self.grid, padding_mode=padding_mode, augment="depth" if is_release else ("depth", "direction")
         )
@@ -108,7 +107,16 @@ class Machine(Model):
 
 
 def moved_center(who: str, cameras: Cameras, pixels: float) -> CameraTensors:
-    """Cameras whose principal points lie so many pixels of the image further right and down."""
+    """Move the principal points of cameras.
+
+    Args:
+        who: the model that asks, named in errors.
+        cameras: of any leading shape.
+        pixels: of the image, to the right and down.
+
+    Returns:
+        Cameras of the same leading shape.
+    """
     tensors = as_tensors(cameras, who)
     offset = torch.zeros_like(tensors.intrinsics)
     offset[..., :2, 2] = pixels

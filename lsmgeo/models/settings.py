@@ -35,9 +35,10 @@ class MachineSettings:
         hidden_channels: of the recurrence's state.
         grid_channels: of the grid network's levels; 64^3 grids take a fourth of 256.
         output_channels: of the grid network's last layer.
-        pixel_rules: "exact", or "release" for the three rules of the released code, which are half a pixel or voxel
-            off: a map's pixel j is taken to lie at j times its stride, a swept map's half a pixel aside, and a sweep
-            reads the voxel half a voxel back. What right geometry buys is measured against it.
+        pixel_rules: "exact", or "release" for the rules of the released code, which are off: pixel j of the features is
+            taken to lie at j times their stride, (stride - 1) / 2 pixels of the image aside; and of D-LSM alone, rays
+            of the swept maps pass the corners of pixels, and read voxels half a voxel back. What right geometry buys
+            is measured against it.
         grid_skip: whether the fused grid itself goes beside it; neither the paper nor the release has this skip, which
             small networks need: it is the one way for detail of the grid's own size.
     """

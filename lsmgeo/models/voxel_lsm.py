@@ -32,7 +32,7 @@ class VoxelLSM(Machine):
     covers what its image covers. The variant "release" has the release's layers one by one (2,730,113 parameters):
     odd strided kernels padded as TensorFlow does, instance norm without scale, no ray directions, features outside an
     image taken from its border. Its pixel and voxel rules, which are half a pixel or voxel off, are not copied: the
-    geometry is this library's in both variants.
+    geometry is this library's in both variants, unless ``pixel_rules="release"`` asks for them.
 
     Args:
         settings: `VoxelSettings`, which follow as keywords; `lsmgeo.models.create` has presets.

@@ -89,7 +89,7 @@ def write_weights(
 
     Raises:
         CheckpointError: the file cannot be written; nothing half-written stays.
-        OptionError: notes that JSON cannot hold.
+        OptionError: notes that JSON cannot hold; with `half`, a weight that overflows float16.
 
     Example:
         >>> import tempfile
@@ -177,7 +177,7 @@ def encode_weights(model: nn.Module, *, about: Mapping[str, Any] | None = None, 
         The content of a safetensors file.
 
     Raises:
-        OptionError: notes that JSON cannot hold.
+        OptionError: notes that JSON cannot hold; with `half`, a weight that overflows float16.
     """
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in model.state_dict().items()}
     if check_flag("write_weights", "half", half):
@@ -284,7 +284,8 @@ def _check_fit(model: nn.Module, weights: Weights) -> None:
         if name not in expected:
             raise CheckpointError(weights.path, f"holds {name}, which the model has not")
         want, have = _describe(expected[name]), _describe(weights.tensors[name])
-        if have != want and have != _describe(expected[name], torch.float16):
+        is_half = expected[name].dtype == torch.float32 and have == _describe(expected[name], torch.float16)
+        if have != want and not is_half:
             raise CheckpointError(weights.path, f"holds {name} as {have}; the model has {want}")
 
 

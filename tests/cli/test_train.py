@@ -78,7 +78,7 @@ def test_a_missing_configuration(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("place", [1, 2])
-@pytest.mark.parametrize("words", [["--quiet"], ["--quiet", "true"], ["--quiet=yes"], ["--no_quiet", "--quiet"]])
+@pytest.mark.parametrize("words", [["--quiet"], ["--quiet", "True"], ["--quiet=yes"], ["--no_quiet", "--quiet"]])
 def test_booleans_are_flags(configuration, tmp_path, capsys, words, place):
     command = ["train", str(configuration), "--out", str(tmp_path), "--set", "run.steps=1"]
     assert cli.main([*command[:place], *words, *command[place:]]) == 0

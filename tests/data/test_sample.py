@@ -179,3 +179,5 @@ def test_the_first_views_of_a_batch():
     for found, expected in zip(some.cameras, batch.cameras, strict=True):
         assert torch.equal(found, expected[:, :2])
     assert torch.equal(some.occupancy, batch.occupancy)
+    with pytest.raises(OptionError, match="views must be a whole number, at least 1; got int 0"):
+        batch.first_views(0)

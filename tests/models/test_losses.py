@@ -172,3 +172,10 @@ def test_the_loss_is_checked():
     given = batch(torch.ones(1, 1, dtype=torch.bool), occupancy=torch.ones(1, 1, 1, 1, dtype=torch.bool))
     with pytest.raises(OptionError, match="loss must be one of 'bce', 'bce\\+iou'"):
         compute_loss(VoxelOutput(torch.zeros(1, 1, 1, 1, 1)), given, loss="iou")
+
+
+@pytest.mark.parametrize("loss", ["bce", "bce+iou"])
+def test_no_scene_is_nothing_to_lose(loss):
+    given = batch(torch.ones(0, 2, dtype=torch.bool), occupancy=torch.ones(0, 2, 2, 2, dtype=torch.bool))
+    total, count = sum_loss(VoxelOutput(torch.zeros(0, 2, 2, 2, 2)), given, loss=loss)
+    assert float(total) == float(count) == 0

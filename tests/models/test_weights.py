@@ -300,3 +300,13 @@ def test_half_precision_that_overflows_is_refused(tmp_path):
     with pytest.raises(OptionError, match="not finite in float16"):
         write_weights(tmp_path / "half.safetensors", model, half=True)
     assert not (tmp_path / "half.safetensors").exists()
+
+
+def test_half_precision_is_for_float32_only(tmp_path, model):
+    """A file whose tensors are half of what the model has otherwise is no file of this model."""
+    path = tmp_path / "double.safetensors"
+    halves = {name: tensor.half() for name, tensor in model.state_dict().items()}
+    path.write_bytes(signed(halves, settings_of(model)))
+    weights.fill_model(create(**settings_of(model)), read_weights(path))
+    with pytest.raises(CheckpointError, match=r"as .* float16; the model has .* float64"):
+        weights.fill_model(create(**settings_of(model)).double(), read_weights(path))

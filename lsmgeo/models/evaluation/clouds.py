@@ -10,6 +10,7 @@ from torch import Tensor
 
 from lsmgeo.cameras import CameraTensors, rays, select
 from lsmgeo.data import Batch
+from lsmgeo.data.sample import first_views
 from lsmgeo.errors import OptionError
 from lsmgeo.metrics import depth_errors, point_cloud_scores
 from lsmgeo.models.evaluation.contenders import Contender, pick
@@ -20,7 +21,7 @@ from lsmgeo.models.evaluation.plane_sweeps import SWEEP, sweep_views
 from lsmgeo.models.evaluation.plots import sheet
 from lsmgeo.models.evaluation.report import Cell, Report, Row, Table
 from lsmgeo.models.evaluation.sequences import as_picture
-from lsmgeo.models.evaluation.shapes import Shapes, SizedShapes, batches, first_views
+from lsmgeo.models.evaluation.shapes import Shapes, SizedShapes, batches
 from lsmgeo.models.pictures import Picture, draw_depth, draw_points
 
 __all__ = ["joint_cloud", "report_clouds"]

@@ -91,7 +91,7 @@ def report_depth(contenders: Sequence[Contender], shapes: Shapes, options: Optio
                 list(rows_drawn.values()),
                 list(rows_drawn),
                 ["first view", "truth", *scores],
-                title=f"depth of the first view, seen from aside; {shapes.about}",
+                title=f"depth of the first view, seen from the side; {shapes.about}",
             )
         },
         notes=notes,

@@ -66,7 +66,7 @@ def evaluate(
     made = make(contenders, shapes, options or Options())
     size = shapes.read(0, 1, resolution=None, depth=False, background="white").images.shape[-1]
     enlarged = [
-        f"images of {size} pixels were enlarged to the {one.size} of {one.name}: they hold less than it was made for"
+        f"images of {size} pixels were enlarged to the {one.size} of {one.name}, which expects more detail"
         for one in contenders
         if one.size > size
     ]

@@ -7,9 +7,9 @@ from torch import Tensor
 
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.classical import visual_hull
+from lsmgeo.data.sample import first_views
 from lsmgeo.grids import VoxelGrid
 from lsmgeo.models.evaluation.scores import iou_by_view
-from lsmgeo.models.evaluation.shapes import first_views
 
 __all__ = ["HULL", "STRICT_HULL", "hull_iou"]
 

@@ -18,9 +18,7 @@ from lsmgeo.models.evaluation.shapes import Shapes, batches
 __all__ = ["measure_iou", "report_iou", "table_of_views"]
 
 VIEWS = 8
-HULL_FALLS = (
-    "The hull of more than three quarters falls from 4 to 5 views, since of 4 silhouettes it asks for all, of 5 for 4."
-)
+HULL_FALLS = "The 0.75 hull drops from 4 to 5 views because it needs all of 4 silhouettes, but only 4 of 5."
 
 
 def report_iou(contenders: Sequence[Contender], shapes: Shapes, options: Options) -> Report:

@@ -26,7 +26,6 @@ __all__ = [
     "SizedShapes",
     "SyntheticShapes",
     "batches",
-    "first_views",
     "open_shapes",
     "resized",
 ]
@@ -352,8 +351,3 @@ def resized(images: Tensor, cameras: CameraTensors, size: int) -> tuple[Tensor, 
     if tuple(images.shape[-2:]) == (size, size):
         return images, cameras
     return resize_images(images.flatten(0, 1), size).unflatten(0, images.shape[:2]), resize(cameras, size, size)
-
-
-def first_views(cameras: CameraTensors, views: int) -> CameraTensors:
-    """The first views of cameras with the leading shape (B, V)."""
-    return CameraTensors(*(torch.as_tensor(field)[:, :views] for field in cameras))

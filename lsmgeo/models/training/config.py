@@ -142,10 +142,11 @@ class RunConfig:
     Attributes:
         steps: the run ends after so many steps; None for no such end.
         minutes: or after so many minutes of training, over all resumes; None for no such end.
-        cpu_minutes: or after so many minutes of the process's CPU time, its evaluations included. The first 30 steps
-            are timed, and the number of steps is computed once: it is `steps` from then on, in ``config.json`` and
-            whenever the run is resumed, so that a schedule counts steps. A cosine begins after these 30. What reading
-            workers take is not counted.
+        cpu_minutes: where `steps` is None, the run ends after so many minutes of the process's CPU time, its
+            evaluations included. The first 30 steps are timed, and the number of steps is computed once: it is `steps`
+            from then on, in ``config.json`` and whenever the run is resumed, so that a schedule counts steps. A cosine
+            begins after these 30. What reading workers take is not counted. Beside `steps`, which take precedence, it
+            says where they came from.
         seed: of the weights, of the order of the shapes and of their views.
         batch: shapes that a process takes at once.
         accumulation: batches whose gradients make one step: a step takes batch x accumulation x processes shapes.

@@ -142,7 +142,7 @@ def _check_content(shards: ShardSet, need: Need) -> None:
     if need.depth and first.depth_step is None:
         raise OptionError(
             f"data: source has no depth, which the model is trained with: {shards.folder} "
-            "(lsmgeo render writes it, unless --depth false)"
+            "(lsmgeo render writes it, unless --no_depth)"
         )
     if need.voxels is not None and need.voxels not in first.voxels:
         there = ", ".join(map(str, first.voxels)) or "none"
@@ -152,8 +152,8 @@ def _check_content(shards: ShardSet, need: Need) -> None:
         )
     if min(first.size) < need.image_size:
         warnings.warn(
-            f"images of {min(first.size)} pixels are enlarged to the {need.image_size} of the model: they hold less "
-            f"than it was made for; lsmgeo render --size {need.image_size} makes them",
+            f"images of {min(first.size)} pixels are enlarged to the {need.image_size} of the model, which expects "
+            f"more detail; lsmgeo render --size {need.image_size} makes them",
             stacklevel=4,
         )
 

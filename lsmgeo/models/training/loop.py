@@ -7,10 +7,11 @@ import json
 import os
 import time
 import warnings
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
 from math import ceil, isfinite
 from pathlib import Path
+from statistics import mean
 from typing import TYPE_CHECKING, Any
 
 from lsmgeo.data import Batch, write_atomic
@@ -83,6 +84,7 @@ class Place:
     best: int | None = None
     best_value: float | None = None
     measured: dict[str, Any] | None = None  # what the last evaluation found
+    timed: list[list[float]] = field(default_factory=list)  # views and CPU seconds of the steps before there is a plan
 
 
 def train(config: TrainingConfig, out: str | os.PathLike[str], *, quiet: bool = False) -> Trained:
@@ -108,7 +110,9 @@ def train(config: TrainingConfig, out: str | os.PathLike[str], *, quiet: bool = 
     """
     config = decided(config, Path(out))
     # One layer of the release never gets a gradient, and what convolves the state gets none from a single view.
-    has_idle_parameters = config.model.variant == "release" or config.data.view_range[0] == 1
+    has_idle_parameters = (
+        config.model.variant == "release" or config.data.view_range[0] == 1 or config.run.loss_views == "random"
+    )
     with (
         started(config.run, has_idle_parameters=has_idle_parameters) as accelerator,
         hold_folder(Path(out)) if accelerator.is_main_process else contextlib.nullcontext(),
@@ -141,7 +145,8 @@ def _train(
         return {**config.to_dict(), "processes": processes, "shapes": shapes.identity}
 
     if checkpoint is not None:
-        check_config(checkpoint, identity(), free=config.free())
+        was_planned = checkpoint.config["run"]["steps"] is not None
+        check_config(checkpoint, identity(), free=config.free() + (() if was_planned else ("run.steps",)))
         checkpoint.restore_model(model)
         checkpoint.restore("optimiser", optimiser)
         checkpoint.restore("guard", guard)
@@ -177,9 +182,13 @@ def _train(
     evaluation: Evaluation | None = None
     ended = ""
     begin, cpu_begin = time.monotonic() - place.seconds, time.process_time() - place.cpu_seconds
+
     # Told before the work, not after.
-    if rank == 0:
+    def write_config() -> None:
         write_atomic(folder / CONFIG, json.dumps(config.to_dict(), indent=1).encode())
+
+    if rank == 0:
+        write_config()
     log = RunLog(
         folder, step=place.step, steps=run.steps, is_writer=rank == 0, tensorboard=run.tensorboard, quiet=quiet
     )
@@ -237,19 +246,24 @@ def _train(
         ) as some:
             return evaluate_model(model, some, stop, region=run.region, loss=run.loss, pictures=pictures)
 
-    def planned(timed: Sequence[float]) -> int:
-        """The number of steps that fill the CPU minutes, by the time of a step and of an evaluation."""
+    def planned() -> int | None:
+        """The number of steps that fill the CPU minutes, by the time of a step and of an evaluation; None at a stop."""
         assert run.cpu_minutes is not None
-        step_seconds = sum(timed) / len(timed)
-        begun = time.process_time()
-        measure(run.batch * processes, 0)
+        by_views: dict[float, list[float]] = {}
+        for views, seconds in place.timed[SLOW_STEPS:] or place.timed:
+            by_views.setdefault(views, []).append(seconds)
+        # Numbers of views are drawn evenly, but so few draws are not even.
+        step_seconds = mean(mean(seconds) for seconds in by_views.values())
+        for _ in range(2):  # the first batch is slower than the others
+            begun = time.process_time()
+            if measure(run.batch * processes, 0) is None:
+                return None
         batches_of_all = ceil(min(run.evaluate_shapes, len(held_back)) / (run.batch * processes))
         evaluation_seconds = (time.process_time() - begun) * batches_of_all
         left = 60 * run.cpu_minutes - (time.process_time() - cpu_begin) - evaluation_seconds
         more = int(left / (step_seconds + evaluation_seconds / run.evaluate_every))
         return gather(place.step + max(1, more))[0]
 
-    timed: list[float] = []
     # Closed whatever happens: the readers are deaf to the signals with which Python ends its children.
     with log, contextlib.closing(batches):
         log.event(
@@ -290,20 +304,24 @@ def _train(
                         place.best, place.best_value = place.step, found.value
                     log.evaluation(place.step, found, seconds=time.monotonic() - begun, best=place.best)
 
-            is_timed = len(timed) > 0 and place.step >= TIMED_STEPS
-            plans = is_timed and run.cpu_minutes is not None and run.steps is None and not ended
+            plans = run.cpu_minutes is not None and run.steps is None and place.step >= TIMED_STEPS and not ended
             if plans:
-                steps = planned(timed[SLOW_STEPS:] or timed)
-                run = replace(run, steps=steps)
-                config = replace(config, run=run)
-                if rank == 0:
-                    write_atomic(folder / CONFIG, json.dumps(config.to_dict(), indent=1).encode())
-                log.plan(steps)
-                saved_step = None  # whatever was saved of this step does not know of it
+                steps = planned()
+                if steps is None:
+                    ended = "stop"
+                else:
+                    run = replace(run, steps=steps)
+                    config = replace(config, run=run)
+                    place.timed.clear()
+                    log.plan(steps)
+                    saved_step = None  # whatever was saved of this step does not know of it
             is_due = ended or plans or place.step % run.checkpoint_every == 0 or place.step == place.best
             if is_due and place.step != saved_step:
-                # The first tells before the work whether the folder can be written.
-                save(must=bool(ended) or place.step == 0)
+                # The first tells before the work whether the folder can be written. Without a plan that is saved a run
+                # that goes on would make another.
+                save(must=bool(ended) or plans or place.step == 0)
+            if plans and rank == 0:
+                write_config()
             if ended:
                 break
 
@@ -318,12 +336,13 @@ def _train(
                 continue
             assert taken is not None
 
+            after = loss_steps(run, place.step, most)
             gradients = find_gradients(
                 wrapped,
                 taken,
                 optimiser,
                 accelerator,
-                steps=loss_steps(run, place.step, most),
+                steps=after,
                 region=run.region,
                 loss=run.loss,
                 terms=terms,
@@ -358,7 +377,9 @@ def _train(
             optimiser.zero_grad()
 
             seconds = time.monotonic() - begun
-            timed.append(time.process_time() - cpu_begun)
+            if run.cpu_minutes is not None and run.steps is None:
+                views = after[0] + 1 if isinstance(after, list) else most
+                place.timed.append([float(views), time.process_time() - cpu_begun])
             if place.step % run.log_every == 0:
                 log.step(
                     place.step,

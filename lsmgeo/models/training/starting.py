@@ -62,7 +62,7 @@ def fast_precision(device: str) -> str:
         device: "auto" or "cpu".
     """
     if device != "cpu" and torch.cuda.is_available():
-        return "bf16" if torch.cuda.is_bf16_supported() else "no"
+        return "bf16" if torch.cuda.is_bf16_supported(including_emulation=False) else "no"
     return "bf16" if torch.cpu.get_capabilities().get("amx_bf16") else "no"
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +23,9 @@ from lsmgeo.models.training.config import DataConfig
 from lsmgeo.scenes import Lights, Scene, synthetic13
 
 __all__ = ["Described", "Renderer", "SyntheticShapes"]
+
+
+MOST_KEPT = 1000
 
 
 class Described(NamedTuple):
@@ -70,6 +72,7 @@ class SyntheticShapes(Dataset[Described]):
     ) -> None:
         self.config, self.size, self.voxels, self.seed = config, size, voxels, seed
         self.views, self.noise = views, noise
+        self._kept: dict[int, tuple[synthetic13.SyntheticShape, Tensor | None]] = {}
         self.background = make_background(config.background)
         names = tuple(synthetic13.CATEGORIES)
         if strange := sorted(set(categories or ()) - set(names)):
@@ -94,13 +97,23 @@ class SyntheticShapes(Dataset[Described]):
     def __len__(self) -> int:
         return len(self.indices)
 
+    def _made(self, number: int) -> tuple[synthetic13.SyntheticShape, Tensor | None]:
+        """A shape and its voxels. A small set is gone through again and again: it is kept."""
+        if number in self._kept:
+            return self._kept[number]
+        shape = synthetic13.shape(self.config.set_seed, number)
+        made = shape, None if self.voxels is None else scenes.voxels([shape.scene], self.voxels)[0]
+        if len(self) <= MOST_KEPT:
+            self._kept[number] = made
+        return made
+
     def __getitem__(self, item: tuple[int, int]) -> Described:
         epoch, index = item
         number, (low, high) = self.indices[index], self.views
         generator = np.random.default_rng(np.random.SeedSequence([self.seed, epoch, index, 0]))
         count = low + int(generator.random() * (high - low + 1))
         chosen = np.argsort(generator.random(self.config.pool), kind="stable")[:count].tolist()
-        shape, occupancy = _made(self.config.set_seed, number, self.voxels)
+        shape, occupancy = self._made(number)
         cameras = synthetic13.views(self.config.set_seed, number, self.config.pool, self.size)
         cameras = CameraTensors(*(torch.as_tensor(value)[chosen] for value in camera_tools.as_tensors(cameras)))
         behind = [self.background(generator, self.size, self.size) for _ in chosen]
@@ -114,14 +127,6 @@ class SyntheticShapes(Dataset[Described]):
             shape.category,
             shape.name,
         )
-
-
-# Small sets are gone through again and again.
-@lru_cache(maxsize=4096)
-def _made(set_seed: int, number: int, voxels: int | None) -> tuple[synthetic13.SyntheticShape, Tensor | None]:
-    """A shape and its voxels."""
-    shape = synthetic13.shape(set_seed, number)
-    return shape, None if voxels is None else scenes.voxels([shape.scene], voxels)[0]
 
 
 @dataclass(frozen=True)

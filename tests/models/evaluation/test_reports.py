@@ -299,8 +299,8 @@ def test_the_hull_that_falls_has_a_footnote(width, falls):
     report = evaluate([Contender("fake", FakeVoxels(by_count))], shapes, "iou", Options(views=5))
     expected = [100 * 32 * width / (128 + 32 * width), 100 * 64 * width / 384]
     np.testing.assert_allclose(values(report, "views", "visual hull")[3:], expected, rtol=1e-12)
-    assert report.tables[0].footnote.startswith("The hull of more than three quarters falls") == falls
-    assert ("three quarters falls" in format_table(report.tables[0])) == falls
+    assert report.tables[0].footnote.startswith("The 0.75 hull drops") == falls
+    assert ("0.75 hull drops" in format_table(report.tables[0])) == falls
     four = evaluate([Contender("fake", FakeVoxels(by_count))], shapes, "iou", Options(views=4))
     assert four.tables[0].footnote == ""
 
@@ -312,7 +312,7 @@ def test_enlarged_images_are_noted():
         [Contender("large", large), Contender("fake", FakeVoxels(by_count))], slabs(), "iou", Options(views=1)
     )
     assert [note for note in report.notes if "enlarged" in note] == [
-        f"images of {SIZE} pixels were enlarged to the {2 * SIZE} of large: they hold less than it was made for"
+        f"images of {SIZE} pixels were enlarged to the {2 * SIZE} of large, which expects more detail"
     ]
 
 

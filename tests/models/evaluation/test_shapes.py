@@ -6,9 +6,10 @@ import torch
 
 from lsmgeo.cameras import stack
 from lsmgeo.data import Recipe, ShardSet, render_set
+from lsmgeo.data.sample import first_views
 from lsmgeo.errors import DataError, OptionError
 from lsmgeo.models.evaluation import open_shapes
-from lsmgeo.models.evaluation.shapes import SizedShapes, batches, first_views, noise_of, resized
+from lsmgeo.models.evaluation.shapes import SizedShapes, batches, noise_of, resized
 from lsmgeo.scenes import synthetic13
 
 READ = {"resolution": 16, "depth": True, "background": "white"}

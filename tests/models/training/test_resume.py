@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import os
 import shutil
 import signal
@@ -192,8 +193,8 @@ def test_evaluations_and_checkpoints_change_nothing(shards, whole, tmp_path):
     assert len(events(tmp_path, "evaluation")) == 6
 
 
-# Of 32 steps, the first 30 timed at a second each: an evaluation of 4 s after every 1000th and at the end.
-CPU_MINUTES = (32 + 2 * 4 + 0.5) / 60
+# The first 5 of 30 steps take 9 s, and so does the first of two trial evaluations; 2.5 s are left after the last one.
+CPU_MINUTES = (5 * 9 + 25 + 9 + 4 + 4 + 2.5) / 60
 
 
 @pytest.fixture(scope="module")
@@ -203,21 +204,23 @@ def timed_config(shards) -> TrainingConfig:
 
 
 @contextlib.contextmanager
-def cpu_clock(second: float = 1.0):
-    """A clock on which a step takes a second, an evaluation of a batch 4, and nothing else any time."""
+def cpu_clock(second: float = 1.0, *, is_new: bool = True):
+    """A clock on which a step takes a second, an evaluation 4, and nothing else any time; the first of each take 9."""
     now = [0.0]
 
-    def takes(seconds, work):
+    def takes(seconds, work, slow=0):
+        calls = itertools.count()
+
         def wrapped(*arguments, **options):
-            now[0] += seconds
+            now[0] += 9 if next(calls) < slow else seconds
             return work(*arguments, **options)
 
         return wrapped
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "time", mock.Mock(wraps=time, process_time=lambda: now[0]))
-        patch.setattr(loop, "find_gradients", takes(second, loop.find_gradients))
-        patch.setattr(loop, "evaluate_model", takes(4.0, loop.evaluate_model))
+        patch.setattr(loop, "find_gradients", takes(second, loop.find_gradients, slow=5 if is_new else 0))
+        patch.setattr(loop, "evaluate_model", takes(4.0, loop.evaluate_model, slow=1))
         yield
 
 
@@ -230,10 +233,10 @@ def timed(timed_config, tmp_path_factory) -> Path:
 
 
 def test_cpu_minutes_become_a_number_of_steps(timed, timed_config):
-    """30 s of steps, 4 of a trial evaluation, 4 of the last one: 2.5 s are left for more."""
+    """What is left after 30 steps and the evaluations is filled with steps of a second: the slow ones do not count."""
     assert [line["steps"] for line in events(timed, "plan")] == [32]
     (stop,) = events(timed, "stop")
-    assert (stop["step"], stop["reason"], stop["cpu_seconds"]) == (32, "steps", 40.0)
+    assert (stop["step"], stop["reason"], stop["cpu_seconds"]) == (32, "steps", 5 * 9 + 27 + 9 + 4 + 4)
     assert read_config(timed / "config.json").run.steps == 32
     rates = {line["step"]: line["learning_rate"] for line in events(timed, "step")}
     assert rates[30] == pytest.approx(0.01)
@@ -245,7 +248,7 @@ def test_steps_that_were_planned_are_never_planned_again(timed, timed_config, tm
     with cpu_clock(), monkeypatch.context() as patch:
         stop_in(patch, 31)
         assert run(timed_config, tmp_path / "killed").step == 31
-    with cpu_clock(second=50.0):
+    with cpu_clock(second=50.0, is_new=False):
         run(timed_config, tmp_path / "killed")
     assert_same_end(tmp_path / "killed", timed)
     assert len(events(tmp_path / "killed", "plan")) == 1
@@ -253,10 +256,40 @@ def test_steps_that_were_planned_are_never_planned_again(timed, timed_config, tm
     assert_same_end(tmp_path / "told", timed)
 
 
-def test_a_run_killed_while_it_is_timed_is_timed_on(timed, timed_config, tmp_path, monkeypatch):
+@pytest.mark.parametrize("step", [3, 29])
+def test_a_run_killed_while_it_is_timed_is_timed_on(timed, timed_config, tmp_path, monkeypatch, step):
+    with cpu_clock(), monkeypatch.context() as patch:
+        stop_in(patch, step)
+        assert run(timed_config, tmp_path).step == step
+    with cpu_clock(is_new=step == 3):
+        run(timed_config, tmp_path)
+    # What was slow again at step 4 to 8 is in the time, not in the plan of step 29.
+    assert (load_checkpoint(tmp_path).step == 32) == (step == 29)
+    if step == 29:
+        assert_same_end(tmp_path, timed)
+
+
+def test_a_stop_while_a_run_is_planned_leaves_no_plan(timed_config, tmp_path, monkeypatch):
+    """SIGTERM comes in step 30: its evaluation is cut short, and a plan made of it would be wrong for good.
+
+    The 9 s that it took are gone, and leave no time for more than the one step that there always is.
+    """
+    with cpu_clock(), monkeypatch.context() as patch:
+        stop_in(patch, 30)
+        stopped = run(timed_config, tmp_path)
+    assert (stopped.step, stopped.ended) == (30, "stop")
+    assert load_checkpoint(tmp_path).config["run"]["steps"] is None
+    assert events(tmp_path, "plan") == []
+    with cpu_clock(is_new=False):
+        run(timed_config, tmp_path)
+    assert [line["steps"] for line in events(tmp_path, "plan")] == [31]
+
+
+def test_a_configuration_that_knows_more_than_the_checkpoint_is_not_refused(timed, timed_config, tmp_path, monkeypatch):
+    """The plan stands in config.json, and the newest checkpoint that verifies is from before it."""
     with cpu_clock(), monkeypatch.context() as patch:
         stop_in(patch, 20)
-        assert run(timed_config, tmp_path).step == 20
-    with cpu_clock():
         run(timed_config, tmp_path)
+    with cpu_clock(is_new=False):
+        run(read_config(timed / "config.json"), tmp_path)
     assert_same_end(tmp_path, timed)

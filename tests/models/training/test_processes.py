@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import socket
@@ -11,6 +12,7 @@ import torch
 
 from lsmgeo.errors import CheckpointError
 from lsmgeo.models.training import loop
+from lsmgeo.models.training.optimising import loss_steps
 from tests.models.training import faults
 from tests.models.training.runs import configure, end_of, events, run, write_shapes
 
@@ -59,6 +61,20 @@ def test_two_processes_learn_what_one_learns(alone, together):
             assert ours[name] == pytest.approx(theirs[name], rel=2e-4), (name, ours["step"])
     (_, weights, _), (_, weights_there, _) = end_of(together), end_of(alone)
     torch.testing.assert_close(weights, weights_there, rtol=1e-3, atol=1e-3)
+
+
+def test_two_processes_plan_together_and_take_steps_of_one_view(shards, tmp_path):
+    """What convolves the state has no gradient after one view; the first process's number of steps is everybody's."""
+    config = configure(shards, steps=None, cpu_minutes=1e-3, batch=1)
+    config = dataclasses.replace(
+        config,
+        data=dataclasses.replace(config.data, views=2),
+        run=dataclasses.replace(config.run, loss_views="random"),
+    )
+    assert {tuple(loss_steps(config.run, step, 2)) for step in range(6)} == {(0,), (1,)}
+    assert in_processes(lambda rank: run(config, tmp_path)) == [0, 0]
+    assert [line["steps"] for line in events(tmp_path, "plan")] == [31]
+    assert end_of(tmp_path)[0] == 31
 
 
 def test_two_processes_evaluate_the_same_set(alone, together):

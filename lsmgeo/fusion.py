@@ -85,11 +85,11 @@ class _Recurrent(nn.Module):
         self,
         in_channels: int,
         hidden_channels: int,
-        kernel_size: int,
-        state_kernel_size: int | None,
         *,
-        norm: bool,
-        eps: float,
+        kernel_size: int = 3,
+        state_kernel_size: int | None = None,
+        norm: bool = True,
+        eps: float = 1e-5,
     ) -> None:
         super().__init__()
         who = type(self).__name__
@@ -109,6 +109,12 @@ class _Recurrent(nn.Module):
             padding=self.kernel_size // 2,
             bias=not norm,
         )
+        self._build()
+        self._initialise()
+
+    def _build(self) -> None:
+        """Make the parts that are a recurrence's own: what works on the state, and its norms."""
+        raise NotImplementedError
 
     def _of_state(self, parts: int) -> nn.Conv3d:
         size, channels = self.state_kernel_size, self.hidden_channels
@@ -220,23 +226,12 @@ class ConvGRU3d(_Recurrent):
 
     parts = 3
 
-    def __init__(
-        self,
-        in_channels: int,
-        hidden_channels: int,
-        *,
-        kernel_size: int = 3,
-        state_kernel_size: int | None = None,
-        norm: bool = True,
-        eps: float = 1e-5,
-    ) -> None:
-        super().__init__(in_channels, hidden_channels, kernel_size, state_kernel_size, norm=norm, eps=eps)
+    def _build(self) -> None:
         self.state_gates = self._of_state(2)
         self.state_candidate = self._of_state(1)
         self.reset_norm = self._layer_norm()
         self.update_norm = self._layer_norm()
         self.candidate_norm = self._layer_norm()
-        self._initialise()
 
     def _step(self, inputs: tuple[Tensor, ...], state: tuple[Tensor, ...] | None) -> tuple[Tensor, ...]:
         reset, update, candidate = inputs
@@ -285,21 +280,10 @@ class ConvLSTM3d(_Recurrent):
 
     parts = 4
 
-    def __init__(
-        self,
-        in_channels: int,
-        hidden_channels: int,
-        *,
-        kernel_size: int = 3,
-        state_kernel_size: int | None = None,
-        norm: bool = True,
-        eps: float = 1e-5,
-    ) -> None:
-        super().__init__(in_channels, hidden_channels, kernel_size, state_kernel_size, norm=norm, eps=eps)
+    def _build(self) -> None:
         self.state_parts = self._of_state(self.parts)
         self.norms = nn.ModuleList(self._layer_norm() for _ in range(self.parts))
         self.memory_norm = self._layer_norm()
-        self._initialise()
 
     def _step(self, inputs: tuple[Tensor, ...], state: tuple[Tensor, ...] | None) -> tuple[Tensor, ...]:
         if state is not None:

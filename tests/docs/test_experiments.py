@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 
 import pytest
 import torch
@@ -14,8 +13,7 @@ from benchmarks.experiments import collecting, queue, running
 from benchmarks.experiments.queue import Experiment
 from lsmgeo.data import Recipe, ShardSet, render_set
 from lsmgeo.models import load
-from lsmgeo.models.training import loop
-from tests.models.training.runs import end_of
+from tests.models.training.runs import end_of, stop_in
 
 SET, SHAPES = Recipe(seed=0, views=2, size=32, voxels=(16,), depth=True), 65
 SMALL = {
@@ -53,18 +51,6 @@ def files(path):
     return {one.name: one.read_bytes() for one in path.iterdir()}
 
 
-def stop_at(monkeypatch, step):
-    find, calls = loop.find_gradients, []
-
-    def find_gradients(*arguments, **options):
-        calls.append(1)
-        if len(calls) == step:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return find(*arguments, **options)
-
-    monkeypatch.setattr(loop, "find_gradients", find_gradients)
-
-
 def test_runs_follow_each_other_and_are_kept(folder, tmp_path, monkeypatch, capsys, asked):
     def run(*words):
         status = command.main([*words, "--folder", str(folder)])
@@ -76,7 +62,7 @@ def test_runs_follow_each_other_and_are_kept(folder, tmp_path, monkeypatch, caps
 
     assert states() == {"first": "next", "second": "-", "third": "-"}
     with monkeypatch.context() as patch:
-        stop_at(patch, 3)
+        stop_in(patch, 3)
         assert run("next")[0] == 143
     assert asked[:2] == [("nice", 19), ("threads", 1)]
     with (folder / "runs" / "first" / "log.jsonl").open("a") as log:

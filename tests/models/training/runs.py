@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from collections.abc import Collection
 from pathlib import Path
 
@@ -11,7 +13,16 @@ from torch import Tensor
 
 from lsmgeo.cameras import orbit
 from lsmgeo.data import Sample, encode_sample, hash_settings, write_shard
-from lsmgeo.models.training import DataConfig, ModelConfig, OptimiserConfig, RunConfig, Trained, TrainingConfig, train
+from lsmgeo.models.training import (
+    DataConfig,
+    ModelConfig,
+    OptimiserConfig,
+    RunConfig,
+    Trained,
+    TrainingConfig,
+    loop,
+    train,
+)
 from lsmgeo.models.training.checkpoints import load_checkpoint
 
 SIZES = {"encoder_channels": (4, 4), "grid_channels": (4,), "feature_channels": 4, "hidden_channels": 4}
@@ -80,3 +91,16 @@ def assert_same_end(folder: Path, expected: Path) -> None:
     torch.testing.assert_close(weights, weights_there, rtol=0, atol=0)
     torch.testing.assert_close(moments, moments_there, rtol=0, atol=0)
     assert losses(folder).items() <= losses(expected).items()
+
+
+def stop_in(monkeypatch, step: int) -> None:
+    """Ask to stop in the middle of a step, the first of the process being 1."""
+    find, calls = loop.find_gradients, []
+
+    def find_gradients(*arguments, **options):
+        calls.append(1)
+        if len(calls) == step:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return find(*arguments, **options)
+
+    monkeypatch.setattr(loop, "find_gradients", find_gradients)

@@ -7,7 +7,6 @@ import dataclasses
 import itertools
 import os
 import shutil
-import signal
 import time
 from pathlib import Path
 from unittest import mock
@@ -18,7 +17,7 @@ from lsmgeo.errors import CheckpointError
 from lsmgeo.models import create
 from lsmgeo.models.training import OptimiserConfig, TrainingConfig, loop, read_config
 from lsmgeo.models.training.checkpoints import load_checkpoint
-from tests.models.training.runs import SIZES, assert_same_end, configure, events, losses, run, write_shapes
+from tests.models.training.runs import SIZES, assert_same_end, configure, events, losses, run, stop_in, write_shapes
 
 
 @pytest.fixture(scope="module")
@@ -45,19 +44,6 @@ def half(shards, tmp_path_factory) -> Path:
 @pytest.fixture
 def begun(half, tmp_path) -> Path:
     return shutil.copytree(half, tmp_path / "run")
-
-
-def stop_in(monkeypatch, step: int) -> None:
-    """Ask to stop in the middle of a step, the first of the process being 1."""
-    find, calls = loop.find_gradients, []
-
-    def find_gradients(*arguments, **options):
-        calls.append(1)
-        if len(calls) == step:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return find(*arguments, **options)
-
-    monkeypatch.setattr(loop, "find_gradients", find_gradients)
 
 
 @pytest.mark.parametrize("step", [1, 3, 4])

@@ -1,4 +1,8 @@
-"""``python -m benchmarks.experiments list | next [NAME] | collect``: see docs/experiments."""
+"""The queue of experiments, see docs/experiments.
+
+"list" says what is done and what is next, "next" trains and evaluates the next one (or that of a name), "collect" keeps the
+results of those that are finished.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.experiments.queue import ALL, QUEUE, Experiment, find
+from benchmarks.experiments.queue import QUEUE, TRIALS, Experiment, find
 
 DEFAULT = Path("experiments")
 
@@ -45,15 +49,17 @@ def show(folder: Path) -> int:
     from benchmarks.experiments.collecting import RESULTS, headline
 
     is_next = True
-    for experiment in ALL:
-        found = state(experiment, folder)
-        if found != "done" and experiment in QUEUE and is_next:
-            found, is_next = f"{found}, next" if found else "next", False
-        words = experiment.what
-        if (kept := RESULTS / f"{experiment.name}.json").is_file():
-            words += f": {headline(json.loads(kept.read_text(encoding='utf-8')))}"
-        minutes = f"{experiment.minutes:g} min"
-        print(f"{experiment.name:<24} {minutes:>8}  {found or '-':<14}  {words}")
+    for title, some in (("the queue, in this order", QUEUE), ("trials, run by name", TRIALS)):
+        print(f"{title}:")
+        for experiment in some:
+            found = state(experiment, folder)
+            if found != "done" and experiment in QUEUE and is_next:
+                found, is_next = f"{found}, next" if found else "next", False
+            words = experiment.what
+            if (kept := RESULTS / f"{experiment.name}.json").is_file():
+                words += f": {headline(json.loads(kept.read_text(encoding='utf-8')))}"
+            minutes = f"{experiment.minutes:g} min"
+            print(f"  {experiment.name:<22} {minutes:>8}  {found or 'not begun':<14}  {words}")
     return 0
 
 

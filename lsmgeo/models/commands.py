@@ -280,20 +280,26 @@ def train(configuration: str, out: str = "lsmgeo-run", set: list[str] | None = N
         quiet: whether to show no progress.
 
     Returns:
-        The exit status: 0, or 143 after SIGTERM, when everything was saved and the same command goes on.
+        The exit status: 0; 143 after SIGTERM or 130 after Ctrl-C, when everything was saved and the same command goes
+        on.
     """
+    import os
     from pathlib import Path
+
+    import torch
 
     from lsmgeo.models import training
 
-    trained = training.train(training.read_config(configuration, set or ()), out, quiet=quiet)
+    config = training.read_config(configuration, set or ())
+    if "OMP_NUM_THREADS" not in os.environ:
+        # The processes that read ahead take a core each: threads that wait for one slow all others down.
+        torch.set_num_threads(max(1, torch.get_num_threads() - config.data.workers))
+    trained = training.train(config, out, quiet=quiet)
     if trained.is_first:
         why = {"steps": "all its steps are taken", "minutes": "its time is over", "stop": "it was asked to"}
         print(f"ended:       at step {trained.step}, since {why[trained.ended]}")
         if trained.evaluation is not None:
-            found = trained.evaluation
-            values = ", ".join(f"{value:.4f}" for value in found.by_view.values())
-            print(f"{found.measure.replace('_', ' ') + ':':<13}{values} after 1 to {len(found.by_view)} views")
+            print(f"{trained.evaluation.title + ':':<13}{trained.evaluation.words}")
         print(f"checkpoint:  {trained.checkpoint.resolve()}")
         best = None if trained.best is None else trained.checkpoint.with_name(f"step_{trained.best:08d}")
         # A full disk may have had no room for it.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from lsmgeo import cli
 from lsmgeo.models import load
 from lsmgeo.models.training import loop
+from lsmgeo.models.training.checkpoints import load_checkpoint
 from tests.models.training.runs import configure, write_shapes
 
 
@@ -32,7 +34,8 @@ def test_a_model_is_trained_and_goes_on(configuration, tmp_path, capsys):
     checkpoint = out / "checkpoints" / "step_00000001"
     assert f"checkpoint:  {checkpoint.resolve()}\n" in printed.out
     assert f"evaluate:    lsmgeo evaluate {checkpoint}\n" in printed.out
-    assert "iou:" in printed.out
+    assert re.search(r"IoU: +\d+\.\d, \d+\.\d % after 1 to 2 views", printed.out)
+    assert re.search(r"step 1: loss \d\.\d{4}", printed.err)
     assert "6 shapes, 2 a step; evaluated on 2" in printed.err
     assert load(out).name == "voxel-lsm"
     assert cli.main(["train", str(configuration), "--out", str(out), "--quiet", "true"]) == 0
@@ -41,16 +44,18 @@ def test_a_model_is_trained_and_goes_on(configuration, tmp_path, capsys):
     assert printed.err == ""
 
 
-def test_a_signal_is_told_by_the_exit_status(configuration, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_is_told_by_the_exit_status(configuration, tmp_path, capsys, monkeypatch, number, status):
     find = loop.find_gradients
 
     def find_gradients(*arguments, **options):
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
         return find(*arguments, **options)
 
     monkeypatch.setattr(loop, "find_gradients", find_gradients)
-    assert cli.main(["train", str(configuration), "--out", str(tmp_path)]) == 143
+    assert cli.main(["train", str(configuration), "--out", str(tmp_path)]) == status
     assert "go on:       the same command" in capsys.readouterr().out
+    assert load_checkpoint(tmp_path).step == 1
 
 
 @pytest.mark.parametrize(

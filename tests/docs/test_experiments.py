@@ -35,7 +35,7 @@ def asked():
 @pytest.fixture
 def folder(tmp_path, monkeypatch, asked):
     for module in (queue, running, collecting, command):
-        for name, value in {"QUEUE": RUNS[:2], "ALL": RUNS, "SET": SET, "SHAPES": SHAPES}.items():
+        for name, value in {"QUEUE": RUNS[:2], "TRIALS": RUNS[2:], "ALL": RUNS, "SET": SET, "SHAPES": SHAPES}.items():
             if hasattr(module, name):
                 monkeypatch.setattr(module, name, value)
     for name, value in {"RESULTS": tmp_path / "results", "PRETRAINED": tmp_path / "pretrained"}.items():
@@ -57,17 +57,17 @@ def test_runs_follow_each_other_and_are_kept(folder, tmp_path, monkeypatch, caps
         return status, capsys.readouterr().out
 
     def states():
-        lines = run("list")[1].splitlines()
+        lines = [line for line in run("list")[1].splitlines() if line.startswith("  ")]
         return {line.split()[0]: line.split("min  ")[1].split("  ")[0] for line in lines}
 
-    assert states() == {"first": "next", "second": "-", "third": "-"}
+    assert states() == {"first": "next", "second": "not begun", "third": "not begun"}
     with monkeypatch.context() as patch:
         stop_in(patch, 3)
         assert run("next")[0] == 143
     assert asked[:2] == [("nice", 19), ("threads", 1)]
     with (folder / "runs" / "first" / "log.jsonl").open("a") as log:
         log.write('{"event": "step", "st')  # a loss of power
-    assert states() == {"first": "at step 3, next", "second": "-", "third": "-"}
+    assert states() == {"first": "at step 3, next", "second": "not begun", "third": "not begun"}
     assert run("next")[0] == 0
     # A run that was stopped is the one that never was.
     whole = running.Folder(tmp_path / "other")
@@ -81,7 +81,7 @@ def test_runs_follow_each_other_and_are_kept(folder, tmp_path, monkeypatch, caps
     torch.testing.assert_close((weights, moments), (weights_there, moments_there), rtol=0, atol=0)
     capsys.readouterr()
 
-    assert states() == {"first": "done", "second": "next", "third": "-"}
+    assert states() == {"first": "done", "second": "next", "third": "not begun"}
     assert run("next")[0] == 0
     assert run("next", "third")[0] == 0
     assert "all experiments are done" in run("next")[1]

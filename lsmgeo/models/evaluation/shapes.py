@@ -146,19 +146,21 @@ class SyntheticShapes:
         indices: their numbers in the set.
         size: height and width of the pictures.
         seed: of the order of views.
+        split: the part of the set that they are of.
         set_seed: which set.
     """
 
     indices: Sequence[int]
     size: int
     seed: int
+    split: str = "test"
     set_seed: int = 0
     most_views: int = POOL
 
     @property
     def about(self) -> str:
         """The set."""
-        return f"{len(self)} test shapes of synthetic-13, rendered at {self.size} x {self.size}"
+        return f"{len(self)} {self.split} shapes of synthetic-13, rendered at {self.size} x {self.size}"
 
     @property
     def categories(self) -> list[str]:
@@ -266,7 +268,7 @@ def open_shapes(
     seed = check_whole("evaluate", "seed", seed, 0, 2**32 - 1)
     number = None if shapes is None else check_whole("evaluate", "shapes", shapes, 1, 10**7)
     if shards is None:
-        return SyntheticShapes(_synthetic_numbers(number or SHAPES, split, categories), size, seed)
+        return SyntheticShapes(_synthetic_numbers(number or SHAPES, split, categories), size, seed, split)
     there = ShardSet(shards)
     names = [category or "all" for category in there.categories]
     wanted = [

@@ -44,6 +44,19 @@ class Evaluation:
         """The measure after the last view."""
         return self.by_view[max(self.by_view)]
 
+    @property
+    def title(self) -> str:
+        """What the measure is called."""
+        return "IoU" if self.measure == "iou" else self.measure.replace("_", " ")
+
+    @property
+    def words(self) -> str:
+        """The measure by the number of views, as people read it."""
+        values = self.by_view.values()
+        shown = [f"{100 * value:.1f}" if self.measure == "iou" else f"{value:.4f}" for value in values]
+        unit = " %" if self.measure == "iou" else ""
+        return f"{', '.join(shown)}{unit} after 1 to {len(shown)} views"
+
     def is_better_than(self, value: float | None) -> bool:
         """Whether the measure is better than a value; any is better than none, and than NaN."""
         if value is None or math.isnan(value):

@@ -115,8 +115,7 @@ class RunLog:
         by_view = {f"{found.measure}/{view}_views": value for view, value in found.by_view.items()}
         by_category = {f"{found.measure}_by_category/{name}": value for name, value in found.categories.items()}
         self.scalars(step, {"loss/held_back": found.loss, **by_view, **by_category})
-        views = ", ".join(f"{value:.4f}" for value in found.by_view.values())
-        self.say(f"step {step}: {found.measure.replace('_', ' ')} after 1 to {len(found.by_view)} views: {views}")
+        self.say(f"step {step}: {found.title} {found.words}")
         if found.examples and self.is_writer:
             self.picture(step, "predicted", draw_examples(found.examples))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import time
 import warnings
 from collections.abc import Iterator
@@ -116,7 +117,7 @@ def train(config: TrainingConfig, out: str | os.PathLike[str], *, quiet: bool = 
     with (
         started(config.run, has_idle_parameters=has_idle_parameters) as accelerator,
         hold_folder(Path(out)) if accelerator.is_main_process else contextlib.nullcontext(),
-        catch_stop() as stop,
+        catch_stop((signal.SIGTERM, signal.SIGINT)) as stop,
     ):
         return _train(config, Path(out), accelerator, stop, quiet=quiet)
 
@@ -390,6 +391,8 @@ def _train(
                     seconds=seconds,
                     waited=waited,
                 )
+            if place.step == 1:
+                log.say(f"step 1: loss {gradients.loss:.4f}")
             log.progress(place.step, f"loss {gradients.loss:.4f}, {seconds:.2f} s a step")
         log.event(
             "stop",

@@ -1,7 +1,7 @@
 """The queue of experiments, see docs/experiments.
 
-"list" says what is done and what is next, "next" trains and evaluates the next one (or that of a name), "collect" keeps the
-results of those that are finished.
+"list" says what is done and what is next, "next" trains and evaluates the next one (or that of a name), "collect" keeps
+the results of those that are finished.
 """
 
 from __future__ import annotations

@@ -139,9 +139,11 @@ BEFORE = {
     "state_kernel": 3,
 }
 
+WIDE = {"grid_channels": [64, 128], "feature_channels": 12, "hidden_channels": 48}
+
 # What settings were chosen by, on the validation split; run by name.
 TRIALS = tuple(
-    replace(trial, is_tested=False, preset="standard" if "wide" in trial.name else "compact")
+    replace(trial, is_tested=False, preset="compact")
     for trial in (
         Experiment(
             "vlsm_before_5",
@@ -160,7 +162,7 @@ TRIALS = tuple(
         ),
         Experiment("vlsm_5", "V-LSM", 5, "voxel-lsm"),
         Experiment("vlsm_20", "V-LSM", 20, "voxel-lsm"),
-        Experiment("vlsm_wide_20", "V-LSM, wider", 20, "voxel-lsm"),
+        Experiment("vlsm_wide_20", "V-LSM, wider", 20, "voxel-lsm", {"model.settings": WIDE}),
         Experiment("dlsm_before_10", "D-LSM as it was before, in float32", 10, "depth-lsm", {"model.settings": BEFORE}),
         Experiment("dlsm_10", "D-LSM", 10, "depth-lsm"),
         Experiment("r2n2_pose_8", "3D-R2N2 with pose", 8, "r2n2-pose"),

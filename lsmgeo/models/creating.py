@@ -34,7 +34,8 @@ def create(name: str, *, preset: str = "paper", variant: str = "paper", **overri
     Args:
         name: "voxel-lsm", "depth-lsm", "r2n2" or "r2n2-pose".
         preset: "paper" (224 pixels, 32^3 voxels), "compact" (128 pixels, 32^3 voxels, made for training on a CPU
-            core in half an hour), "standard" (wider) or "tiny" (32 pixels, 16^3 voxels, made for tests).
+            core in half an hour), "standard" (what the experiments use, which is compact) or "tiny" (32 pixels, 16^3
+            voxels, made for tests).
         variant: "paper", or "release" for the layers of the released network, of "voxel-lsm" and "depth-lsm" alone.
         **overrides: settings by name in place of the preset's, see `VoxelSettings`, `DepthSettings` and `R2N2Settings`.
 

@@ -58,9 +58,11 @@ class StopRequest:
             return None
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self:
+        if self.signal == number:
             # Whoever asks twice does not want to wait; a checkpoint cut off here is as after a loss of power.
             os._exit(128 + number)
+        if self:  # Ctrl-C reaches torchrun too, which then sends its processes SIGTERM
+            return
         self.signal = number
         if self._waiting:
             self._waiting = False
@@ -73,7 +75,7 @@ class _Asked(BaseException):
 
 @contextlib.contextmanager
 def catch_stop(signals: Sequence[int] = (signal.SIGTERM,)) -> Iterator[StopRequest]:
-    """Inside this context the first signal only sets a flag; the second one ends the process at once.
+    """Inside this context the first signal only sets a flag; the same signal again ends the process at once.
 
     The flag is to be looked at wherever training spends time: between steps, between the batches of an evaluation,
     after a checkpoint, and while waiting for data (`StopRequest.next_item`). The handlers from before come back at the

@@ -155,7 +155,8 @@ class RunConfig:
             where the hardware multiplies it faster (GPUs that know it, CPUs with AMX), decided once for the run.
         channels_last: whether feature maps are kept pixel by pixel in memory; None where it is faster for the network.
         loss: of voxels: "bce", the paper's cross-entropy, or "bce+iou", see `lsmgeo.models.compute_loss`.
-        loss_views: the loss is taken after "every" view, after a "random" one, or after the "last" alone.
+        loss_views: the loss is taken after "every" view, after a "random" one (later views are not read, and of depth
+            that of the views so far counts), or after the "last" alone.
         region: of depth, the pixels of the loss: the "object", or "all" with the background far away.
         evaluate_every: steps between evaluations; the end is always evaluated.
         evaluate_shapes: how many shapes of the validation split are evaluated on, always the same.

@@ -90,8 +90,8 @@ def find_gradients(
     for index, batch in enumerate(batches):
         is_last = index == len(batches) - 1
         with contextlib.nullcontext() if is_last else accelerator.no_sync(wrapped):
-            if isinstance(steps, list) and batch.depth is None:
-                # What is read after the last of them reaches no loss of voxels.
+            if isinstance(steps, list):
+                # What is read after the last of them reaches no loss of voxels; of depth, that of the views so far counts.
                 batch = batch.first_views(max(steps) + 1)
             output = wrapped(batch.images, batch.cameras, batch.view_mask, steps=steps)
             part, number = sum_loss(output, batch, region=region, loss=loss, steps=steps)

@@ -91,7 +91,7 @@ def find_gradients(
         is_last = index == len(batches) - 1
         with contextlib.nullcontext() if is_last else accelerator.no_sync(wrapped):
             if isinstance(steps, list):
-                # What is read after the last of them reaches no loss of voxels; of depth, that of the views so far counts.
+                # What is read later reaches no loss of voxels; of depth, that of the views so far counts.
                 batch = batch.first_views(max(steps) + 1)
             output = wrapped(batch.images, batch.cameras, batch.view_mask, steps=steps)
             part, number = sum_loss(output, batch, region=region, loss=loss, steps=steps)

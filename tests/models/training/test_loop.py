@@ -16,6 +16,7 @@ import torch
 from PIL import Image
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from lsmgeo.cameras import CameraTensors
 from lsmgeo.data import Recipe, render_set
 from lsmgeo.errors import OptionError, TrainingError
 from lsmgeo.metrics import median_depth_error, voxel_iou
@@ -211,6 +212,34 @@ def test_depth_is_learnt_and_drawn(tmp_path):
     assert not trained.evaluation.is_better_than(0.0)
     with Image.open(tmp_path / "run" / "pictures" / "predicted_00000001.png") as picture:
         assert picture.size == (2 * 96 + 4, 5 * 96 + 4 * 4)
+
+
+def test_the_loss_of_depth_after_a_random_view_is_that_of_the_views_so_far(tmp_path):
+    """Every logged loss, from the first views of the step's batch alone; it learns too slowly to change."""
+    render_set("synthetic-13", tmp_path / "shards", Recipe(0, 3, 32, (16,)), shapes=13, jobs=1)
+    config = TrainingConfig(
+        model=ModelConfig(name="depth-lsm", preset="tiny"),
+        data=DataConfig(source=str(tmp_path / "shards"), views=3, validation_split="train", limit=4, workers=0),
+        optimiser=OptimiserConfig(learning_rate=1e-30),
+        run=RunConfig(steps=4, batch=2, loss_views="random", evaluate_shapes=1, pictures=0, log_every=1, seed=3),
+    )
+    run(config, tmp_path / "run")
+    torch.manual_seed(3)
+    model = create("depth-lsm", preset="tiny")
+    shapes = open_shapes(config.data, Need(32, None, True), seed=3, device=CPU, is_training=True)
+    options = {"start": 0, "batch": 2, "workers": 0, "device": CPU, "rank": 0, "processes": 1}
+    expected, drawn = [], []
+    with contextlib.closing(training_batches(shapes, seed=3, **options)) as batches:
+        for step, batch in enumerate(itertools.islice(batches, 4)):
+            views = optimising.loss_steps(config.run, step, 3)[0] + 1
+            cameras = CameraTensors(*(field[:, :views] for field in batch.cameras))
+            with torch.no_grad():
+                depth = model(batch.images[:, :views], cameras, steps="last").depth[:, 0]
+            on = batch.mask[:, :views] & (batch.depth[:, :views] > 0)
+            expected.append(float((depth - batch.depth[:, :views])[on].abs().mean()))
+            drawn.append(views)
+    assert len(set(drawn)) > 1
+    assert list(losses(tmp_path / "run").values()) == pytest.approx(expected, rel=1e-5)
 
 
 def test_minutes_end_a_run(shards, tmp_path):

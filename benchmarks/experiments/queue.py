@@ -90,7 +90,7 @@ class Experiment:
 
 USUAL: Mapping[str, Mapping[str, Any]] = {
     "voxel-lsm": {"optimiser.learning_rate": 2e-3, "run.loss_views": "random"},
-    "depth-lsm": {"optimiser.learning_rate": 2e-3, "run.loss_views": "random"},
+    "depth-lsm": {"optimiser.learning_rate": 2e-3, "run.loss_views": "last"},
     "r2n2": {"optimiser.learning_rate": 3e-4, "run.loss_views": "random"},
     "r2n2-pose": {"optimiser.learning_rate": 3e-4, "run.loss_views": "random"},
 }
@@ -168,10 +168,12 @@ TRIALS = tuple(
             "D-LSM as it was before, in float32",
             10,
             "depth-lsm",
-            {"model.settings": BEFORE, "run.loss_views": "last"},
+            {"model.settings": BEFORE},
         ),
-        Experiment("dlsm_last_10", "D-LSM, the loss after the last view", 10, "depth-lsm", {"run.loss_views": "last"}),
         Experiment("dlsm_10", "D-LSM", 10, "depth-lsm"),
+        Experiment(
+            "dlsm_random_10", "D-LSM, the loss after a random view", 10, "depth-lsm", {"run.loss_views": "random"}
+        ),
         Experiment("r2n2_pose_8", "3D-R2N2 with pose", 8, "r2n2-pose"),
         Experiment("r2n2_pose_fast_8", "3D-R2N2 with pose, 1e-3", 8, "r2n2-pose", {"optimiser.learning_rate": 1e-3}),
         Experiment(

@@ -28,7 +28,7 @@ class ModelConfig:
 
     Attributes:
         name: "voxel-lsm", "depth-lsm", "r2n2" or "r2n2-pose".
-        preset: "paper", "compact" or "tiny".
+        preset: "paper", "compact", "standard" or "tiny".
         variant: "paper" or "release".
         settings: what differs from the preset, as `create` takes it.
         weights: a file of weights to begin with (`lsmgeo.models.load`) whose model is of the same settings, or None.

@@ -66,13 +66,14 @@ def show(folder: Path) -> int:
 def state(experiment: Experiment, folder: Path) -> str:
     """How far a run is: "done", also where its results are committed, the step that it has come to, or nothing."""
     from benchmarks.experiments.collecting import RESULTS
-    from benchmarks.experiments.running import EVALUATION
+    from benchmarks.experiments.running import Folder
+    from lsmgeo.models.run_folders import checkpoint_folders
 
-    run = folder / "runs" / experiment.name
-    if (RESULTS / f"{experiment.name}.json").is_file() or (run / EVALUATION).is_file():
+    runs = Folder(folder)
+    if (RESULTS / f"{experiment.name}.json").is_file() or runs.is_done(experiment):
         return "done"
-    steps = sorted((run / "checkpoints").glob("step_*[0-9]"))
-    return f"at step {int(steps[-1].name.removeprefix('step_'))}" if steps else ""
+    steps = checkpoint_folders(runs.run(experiment))
+    return f"at step {max(steps)}" if steps else ""
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from lsmgeo.data import Batch, ShardSet, render_set, write_atomic
 from lsmgeo.errors import OptionError
 from lsmgeo.metrics import DepthError, VoxelIoU
 from lsmgeo.models import Model, evaluation, load, training
+from lsmgeo.models.evaluation.report import finite
 from lsmgeo.models.evaluation.shapes import SizedShapes, batches
 from lsmgeo.models.training.checkpoints import load_checkpoint
 from lsmgeo.models.training.evaluating import evaluate_model
@@ -231,12 +232,3 @@ def validate_thresholds(model: Model, experiment: Experiment, folder: Folder) ->
         for measure in measures.values():
             measure.update(occupancy, batch.occupancy, [name or "all" for name in batch.category])
     return {str(level): round(measure.compute().mean, 5) for level, measure in measures.items()}
-
-
-def finite(value: Any) -> Any:
-    """The same with None for every number that JSON has not."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

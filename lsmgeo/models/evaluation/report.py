@@ -16,7 +16,7 @@ import numpy as np
 
 from lsmgeo.data import write_atomic, write_point_cloud
 
-__all__ = ["Cell", "Report", "Row", "Table", "format_table", "write_report"]
+__all__ = ["Cell", "Report", "Row", "Table", "finite", "format_table", "write_report"]
 
 MARK = "*"
 
@@ -180,16 +180,16 @@ def _plain(report: Report) -> dict[str, Any]:
         "facts": dict(report.facts),
         "notes": list(report.notes),
         "tables": tables,
-        "shapes": [_finite(shape) for shape in report.shapes],
+        "shapes": [finite(shape) for shape in report.shapes],
     }
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """The same with None for every number that JSON has not."""
     if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     return _number(value) if isinstance(value, float) else value
 
 

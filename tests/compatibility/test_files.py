@@ -29,11 +29,13 @@ def files(request, tmp_path, monkeypatch) -> Path:
 def assert_holds(found: object, expected: object, where: str = "") -> None:
     """Numbers are equal but for what another CPU rounds; all else is equal."""
     if isinstance(expected, dict):
-        assert isinstance(found, dict) and found.keys() == expected.keys(), where
+        assert isinstance(found, dict), where
+        assert found.keys() == expected.keys(), where
         for key in expected:
             assert_holds(found[key], expected[key], f"{where}/{key}")
     elif isinstance(expected, list):
-        assert isinstance(found, list) and len(found) == len(expected), where
+        assert isinstance(found, list), where
+        assert len(found) == len(expected), where
         for index, (one, other) in enumerate(zip(found, expected, strict=True)):
             assert_holds(one, other, f"{where}/{index}")
     elif isinstance(expected, float):

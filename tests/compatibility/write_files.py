@@ -1,4 +1,4 @@
-"""Writes what later versions must still load, with what it holds beside it: `python -m tests.compatibility.write_files NEW_FOLDER`.
+"""Writes what later versions must still load: ``python -m tests.compatibility.write_files NEW_FOLDER``.
 
 The files of a folder are never written again: a change of a format writes another folder, and both must load.
 """

@@ -18,6 +18,7 @@ __all__ = [
     "check_choice",
     "check_choices",
     "check_devices",
+    "check_finite",
     "check_flag",
     "check_float",
     "check_geometry",
@@ -70,6 +71,12 @@ def check_geometry(
     check_float(who, name, value, expected, rank, dtypes)
     if value.numel() > LARGEST_COUNT:
         raise ShapeError(f"{who}: {name} must be {expected}, 2^31 - 1 numbers at most; got {tuple(value.shape)}")
+
+
+def check_finite(who: str, name: str, value: Tensor) -> None:
+    """Require a tensor without NaNs and infinities."""
+    if not bool(value.isfinite().all()):
+        raise OptionError(f"{who}: {name} must be finite; got a NaN or an infinity")
 
 
 def check_mask(who: str, name: str, value: Any, shape: tuple[int, ...], expected: str) -> None:

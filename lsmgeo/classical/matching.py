@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from lsmgeo import functional
-from lsmgeo._checks import check_choice, check_float, check_mask, check_number, check_size, check_whole
+from lsmgeo._checks import check_choice, check_finite, check_float, check_mask, check_number, check_size, check_whole
 from lsmgeo.cameras import CameraTensors, select
 from lsmgeo.cameras.tensors import Cameras, as_tensors
 from lsmgeo.classical.correlation import UNRELATED, Correlation, on_threads
@@ -171,6 +171,7 @@ def warp_neighbours(
     check_float(who, "images", images, "(V, C, h, w)", rank=4)
     if images.shape[0] < 2:
         raise ShapeError(f"{who}: images must be (V, C, h, w) with V at least 2; got {tuple(images.shape)}")
+    check_finite(who, "images", images)
     check_float(who, "depths", depths, "(P,)", rank=1)
     tensors = as_tensors(cameras, who)
     if tuple(tensors.cam_from_world.shape[:-2]) != (len(images),):

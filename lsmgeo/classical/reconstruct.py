@@ -372,6 +372,5 @@ def points_of(depth: Tensor, camera: CameraTensors) -> Tensor:
     Returns:
         (h, w, 3) float64.
     """
-    origin, directions = rays(camera, (depth.shape[0], depth.shape[1]))
-    forward = camera.cam_from_world[2, :3]
-    return origin + directions * (depth.double() / (directions * forward).sum(-1))[..., None]
+    origin, directions = (value.double() for value in rays(camera, (depth.shape[0], depth.shape[1])))
+    return origin + directions * (depth.double() / (directions @ camera.cam_from_world[2, :3].double()))[..., None]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from lsmgeo._checks import check_number, check_whole, describe
+from lsmgeo._checks import check_finite, check_number, check_whole, describe
 from lsmgeo.classical.tsdf import Tsdf
 from lsmgeo.data.files import write_atomic
 from lsmgeo.errors import DataError, DTypeError, GridError, OptionError, ShapeError
@@ -91,8 +91,7 @@ def extract_mesh(
     if tuple(values.shape) != grid.shape:
         raise ShapeError(f"{who}: field must be {grid.shape}, as the grid; got {tuple(values.shape)}")
     values = values.detach().cpu()
-    if not bool(values.isfinite().all()):
-        raise OptionError(f"{who}: field must be finite; got a NaN or an infinity")
+    check_finite(who, "field", values)
     if isinstance(field, Tsdf):
         surface = 0.0 if level is None else level
         # Larger inside, like every other field.
@@ -126,6 +125,9 @@ def drop_specks(mesh: SurfaceMesh, faces: int) -> SurfaceMesh:
     Returns:
         What is left, perhaps nothing.
     """
+    if not isinstance(mesh, SurfaceMesh):
+        raise DTypeError(f"drop_specks: mesh must be a SurfaceMesh; got {describe(mesh)}")
+    check_whole("drop_specks", "faces", faces, 0)
     if len(mesh.faces) == 0:
         return mesh
     from scipy.sparse import coo_array

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from lsmgeo import functional
-from lsmgeo._checks import check_geometry, check_mask, check_number, check_whole, describe
+from lsmgeo._checks import check_finite, check_geometry, check_mask, check_number, check_whole, describe
 from lsmgeo._sites import Cameras
 from lsmgeo.cameras import CameraTensors, as_tensors, resize, stack
 from lsmgeo.cameras.tensors import select
@@ -94,8 +94,10 @@ def fuse_depth(
     who = "fuse_depth"
     _check_grid(who, grid)
     tensors = as_tensors(cameras, who)
-    if tensors.intrinsics.dim() != 3:
-        raise ShapeError(f"{who}: cameras must have the leading shape (V,); got {tuple(tensors.intrinsics.shape[:-2])}")
+    if tensors.intrinsics.dim() != 3 or not len(tensors.intrinsics):
+        raise ShapeError(
+            f"{who}: cameras must have the leading shape (V,), V at least 1; got {tuple(tensors.intrinsics.shape[:-2])}"
+        )
     views = len(tensors.intrinsics)
     truncation = TRUNCATION * voxel_side(grid) if truncation is None else truncation
     if not check_number(who, "truncation", truncation, "a positive number") > 0:
@@ -323,6 +325,7 @@ def _checked(who: str, view: int, depth: Any, colours: Any, weights: Any, backgr
             raise ShapeError(
                 f"{who}: colours[{view}] must be {(3, *size)}, of its depth map; got {tuple(colours.shape)}"
             )
+        check_finite(who, f"colours[{view}]", colours)
     if weights is not None:
         check_geometry(who, f"weights[{view}]", weights, "(h, w)", rank=2, dtypes=(depth.dtype,))
         if tuple(weights.shape) != size:

@@ -8,12 +8,19 @@ import numpy as np
 import torch
 
 from lsmgeo._checks import check_whole
-from lsmgeo.cameras import CameraTensors, resize
+from lsmgeo.cameras import CameraTensors, resize, stack
 from lsmgeo.data import PosedImages
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import FrustumGrid, depth_planes
 
-__all__ = ["camera_centers", "common_point", "default_depth_range", "measured_depth_range", "select_neighbours"]
+__all__ = [
+    "camera_centers",
+    "common_point",
+    "default_depth_range",
+    "measured_depth_range",
+    "project",
+    "select_neighbours",
+]
 
 # Below the first angle a pair says little about depth, above the last its patches hardly look alike any more.
 SMALLEST_ANGLE, BEST_ANGLE, LARGEST_ANGLE = 1.5, 10.0, 60.0
@@ -32,6 +39,16 @@ def camera_centers(cameras: CameraTensors) -> np.ndarray:
     """Camera centres ``-R^T t``, (V, 3)."""
     E = cameras.cam_from_world.double().numpy()
     return -np.einsum("vji,vj->vi", E[:, :3, :3], E[:, :3, 3])
+
+
+def project(cameras: CameraTensors, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels (V, N, 2), camera z (V, N) and visibility (V, N) of points (N, 3); pixels mean nothing unless in front."""
+    K, E = (value.double().numpy() for value in cameras[:2])
+    seen = points @ E[:, :3, :3].swapaxes(1, 2) + E[:, None, :3, 3]
+    z = seen[..., 2]
+    pixels = (seen @ K.swapaxes(1, 2))[..., :2] / np.where(z > 0, z, 1.0)[..., None]
+    sizes = np.stack([np.broadcast_to(np.asarray(size), len(K)) for size in (cameras.width, cameras.height)], -1)
+    return pixels, z, (z > 0) & ((pixels >= -0.5) & (pixels < sizes[:, None] - 0.5)).all(-1)
 
 
 def common_point(cameras: CameraTensors) -> np.ndarray:
@@ -89,7 +106,7 @@ def select_neighbours(
             if weight < LEAST_SHARED_POINTS:
                 continue
         else:
-            points = frustum[_is_seen(scene, other, frustum)]
+            points = frustum[project(stack([scene.camera(other)]), frustum)[2][0]]
             weight = len(points) / len(frustum)
             if weight < LEAST_SHARED_FRUSTUM:
                 continue
@@ -118,17 +135,6 @@ def _frustum_points(scene: PosedImages, view: int, near: float, far: float) -> n
     camera = resize(scene.camera(view), *FRUSTUM_SHAPE[1:])
     depths = depth_planes(near, far, FRUSTUM_SHAPE[0], spacing="inverse")
     return FrustumGrid(camera, depths, FRUSTUM_SHAPE[1:]).centers().reshape(-1, 3).double().numpy()
-
-
-def _is_seen(scene: PosedImages, view: int, points: np.ndarray) -> np.ndarray:
-    """Which world points (N, 3) lie in a view's picture, (N,) bool."""
-    K, E = (value[view].double().numpy() for value in scene.cameras[:2])
-    image = (points @ E[:3, :3].T + E[:3, 3]) @ K.T
-    z = np.where(image[:, 2] > 0, image[:, 2], np.nan)
-    with np.errstate(invalid="ignore"):
-        pixels = image[:, :2] / z[:, None]
-        height, width = scene.size(view)
-        return np.asarray(((pixels > -0.5) & (pixels < (width - 0.5, height - 0.5))).all(1))
 
 
 def measured_depth_range(scene: PosedImages, view: int) -> tuple[float, float] | None:

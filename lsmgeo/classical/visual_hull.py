@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_max_pool2d, pad
 
 from lsmgeo import functional
-from lsmgeo._checks import check_choice, check_geometry, check_number, check_whole, describe
+from lsmgeo._checks import check_choice, check_finite, check_geometry, check_number, check_whole, describe
 from lsmgeo._sites import Cameras
 from lsmgeo.cameras import CameraTensors, as_tensors, crop, rays, resize, stack
 from lsmgeo.cameras.tensors import select
@@ -156,6 +156,7 @@ def _maps_of_views(who: str, masks: Tensor | Sequence[Tensor]) -> list[Tensor]:
     numbers = [view.float() if view.dtype == torch.bool else view for view in views]
     for view in numbers:
         check_geometry(who, "masks", view, "(V, h, w) or (B, V, h, w), bool or")
+        check_finite(who, "masks", view)
     return numbers
 
 
@@ -177,6 +178,7 @@ def hull_box(
         Lower and upper corner as x, y, z.
 
     Raises:
+        ShapeError, DTypeError: masks that are no bool (h, w), or not one for each camera.
         OptionError: a silhouette is empty, all are from one direction, nothing projects into all of them, or margin is
             negative.
     """
@@ -184,11 +186,16 @@ def hull_box(
     tensors = as_tensors(cameras, who)
     if check_number(who, "margin", margin, "a number, 0 at least") < 0:
         raise OptionError(f"{who}: margin must be 0 at least; got {margin}")
-    if len(masks) == 0 or len(masks) != len(tensors.intrinsics):
-        raise ShapeError(
-            f"{who}: masks must be one for each of the {len(tensors.intrinsics)} cameras; got {len(masks)}"
-        )
+    leading = tuple(tensors.intrinsics.shape[:-2])
+    if len(leading) != 1:
+        raise ShapeError(f"{who}: cameras must have the leading shape (V,); got {leading}")
+    if not isinstance(masks, Tensor | Sequence) or isinstance(masks, str):
+        raise DTypeError(f"{who}: masks must be a bool tensor (V, h, w), or V of (h, w); got {describe(masks)}")
+    if len(masks) == 0 or len(masks) != leading[0]:
+        raise ShapeError(f"{who}: masks must be one for each of the {leading[0]} cameras; got {len(masks)}")
     for view, mask in enumerate(masks):
+        if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.dim() != 2:
+            raise DTypeError(f"{who}: masks[{view}] must be a bool tensor (h, w); got {describe(mask)}")
         if not bool(mask.any()):
             raise OptionError(f"{who}: the silhouette of view {view} is empty")
     pictures = [_thinned(mask, select(tensors, 0, view)) for view, mask in enumerate(masks)]

@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 from lsmgeo.cameras import CameraTensors, crop, resize, select, stack
 from lsmgeo.classical.gathering import resized
 from lsmgeo.classical.silhouettes import signed_distance
-from lsmgeo.classical.views import camera_centers, common_point
+from lsmgeo.classical.views import camera_centers, common_point, project
 from lsmgeo.classical.visual_hull import hull_box, visual_hull
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid
@@ -100,7 +100,7 @@ def place_object(scene: PosedImages, masks: Sequence[Tensor] | None, views: Sequ
             pass  # from one direction, or they do not belong together: what is left tells more
     if points is None and scene.points is not None:
         points, told_by, trimmed = scene.points.positions @ turn.T, "sparse points", QUANTILES
-        points = points[_is_shared(turned, points)]
+        points = points[project(turned, points)[2].mean(0) >= SHARED]
     if points is not None and len(points) >= LEAST_POINTS:
         placement = _around(points, trimmed, turn, told_by)
         return _as_trained(scene, placement) or placement
@@ -134,9 +134,8 @@ def in_model_frame(cameras: CameraTensors, placement: Placement) -> CameraTensor
 
 def seen_from(scene: PosedImages, placement: Placement) -> tuple[np.ndarray, np.ndarray]:
     """How far in front of each camera the object is, in its own sizes, and whether its middle is in the picture."""
-    cameras = in_model_frame(scene.cameras, placement)
-    pixels, z = _projected(cameras, np.zeros((1, 3)))
-    return z[:, 0], _in_picture(cameras, pixels, z)[:, 0]
+    _, z, visible = project(in_model_frame(scene.cameras, placement), np.zeros((1, 3)))
+    return z[:, 0], visible[:, 0]
 
 
 def spread_views(scene: PosedImages, placement: Placement, usable: Sequence[int], count: int) -> list[int]:
@@ -176,7 +175,7 @@ def frame_view(scene: PosedImages, view: int, placement: Placement, size: int, m
     if mask is not None and not scene.cut_out:  # a cut-out photograph is before white already, with soft edges
         image = torch.where(mask, image, 1.0)
     camera = stack([scene.camera(view)])
-    pixels, z = _projected(in_model_frame(camera, placement), np.zeros((1, 3)))
+    pixels, z, _ = project(in_model_frame(camera, placement), np.zeros((1, 3)))
     (x, y), depth = pixels[0, 0], z[0, 0]
     rows, columns = image.shape[-2:]
     sides = [max(1, round(FIELD * float(camera.intrinsics[0, axis, axis]) / depth)) for axis in (1, 0)]
@@ -293,24 +292,3 @@ def _upright(cameras: CameraTensors) -> np.ndarray:
         return np.diag([1.0, -1.0, -1.0])
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.asarray(np.eye(3) + cross + cross @ cross / (1 + cosine))
-
-
-def _projected(cameras: CameraTensors, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (V, N, 2) and camera z (V, N) of points (N, 3); a pixel of what is not in front means nothing."""
-    E, K = cameras.cam_from_world.double().numpy(), cameras.intrinsics.double().numpy()
-    seen = points @ E[:, :3, :3].swapaxes(1, 2) + E[:, None, :3, 3]
-    z = seen[..., 2]
-    pixels = (seen @ K.swapaxes(1, 2))[..., :2] / np.where(z > 0, z, 1.0)[..., None]
-    return pixels, z
-
-
-def _in_picture(cameras: CameraTensors, pixels: np.ndarray, z: np.ndarray) -> np.ndarray:
-    height, width = (torch.as_tensor(part).numpy()[:, None] for part in cameras[2:])
-    x, y = pixels[..., 0], pixels[..., 1]
-    return (z > 0) & (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
-
-
-def _is_shared(cameras: CameraTensors, points: np.ndarray) -> np.ndarray:
-    """Which points (N, 3) lie in most of the pictures."""
-    pixels, z = _projected(cameras, points)
-    return np.asarray(_in_picture(cameras, pixels, z).mean(0) >= SHARED)

@@ -270,6 +270,7 @@ def test_gradients_flow_through_aggregation():
         ({"images": random_images(1)[:1]}, ShapeError, r"V at least 2; got \(1, 1, 9, 12\)"),
         ({"images": random_images(2)}, ShapeError, "for this score"),
         ({"images": random_images(1).numpy()}, DTypeError, "images must be a tensor"),
+        ({"images": random_images(1) * float("nan")}, OptionError, "images must be finite"),
         ({"depths": torch.tensor([2.0, 1.0])}, GridError, "strictly ascending"),
         ({"depths": torch.tensor([[2.0, 3.0]])}, ShapeError, r"depths must be \(P,\)"),
         (

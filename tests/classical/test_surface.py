@@ -154,6 +154,11 @@ def test_specks_are_dropped():
     assert len(extract_mesh(occupancy, grid, specks=8).faces) == len(whole.faces)
     assert len(drop_specks(whole, 10**6).faces) == 0
     assert len(drop_specks(drop_specks(whole, 10**6), 1).faces) == 0
+    with pytest.raises(DTypeError, match="drop_specks: mesh"):
+        drop_specks(None, 1)
+    for junk in (None, -1, 1.5, "many"):
+        with pytest.raises(OptionError, match="drop_specks: faces"):
+            drop_specks(whole, junk)
 
 
 @pytest.mark.parametrize("ending", ["ply", "glb", "PLY"])

@@ -344,6 +344,7 @@ def test_bad_input_is_refused():
         ({"depths": [depth[0], depth[1].double(), depth[2]]}, DTypeError),
         ({"colours": torch.ones(3, 3, 8, 8)}, ShapeError),
         ({"colours": torch.ones(2, 3, 8, 9)}, ShapeError),
+        ({"colours": torch.full((3, 3, 8, 9), float("nan"))}, OptionError),
         ({"weights": torch.ones(3, 9, 8)}, ShapeError),
         ({"weights": -torch.ones(3, 8, 9)}, OptionError),
         ({"background": torch.ones(3, 8, 9)}, DTypeError),
@@ -353,6 +354,7 @@ def test_bad_input_is_refused():
         ({"grid": 4}, DTypeError),
         ({"grid": VoxelGrid(4, world_from_grid=torch.eye(4).repeat(2, 1, 1))}, GridError),
         ({"cameras": select(tensors, 0, 0)}, ShapeError),
+        ({"cameras": CameraTensors(*(field[:0] for field in tensors[:2]), 8, 9), "depths": depth[:0]}, ShapeError),
         ({"cameras": tensors._replace(intrinsics=torch.zeros(3, 3, 3).double())}, CameraError),
     ):
         arguments = {"depths": depth, "cameras": tensors, "grid": grid} | bad

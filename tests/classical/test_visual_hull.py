@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lsmgeo import VoxelGrid
-from lsmgeo.cameras import CameraTensors
+from lsmgeo.cameras import CameraTensors, select
 from lsmgeo.classical import default_grid, extract_mesh, hull_box, signed_distance, visual_hull
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
 from tests import oracle
@@ -229,6 +229,11 @@ def test_boxes_of_silhouettes_that_do_not_belong_together_are_refused():
         hull_box(list(masks[:2]), cameras.tensors())
     with pytest.raises(OptionError, match="margin"):
         hull_box(list(masks), cameras.tensors(), margin=-1.0)
+    for junk in (None, 3, "masks", [None] * 6, masks.float(), masks[:, 0], list(masks.numpy())):
+        with pytest.raises(DTypeError, match="hull_box: masks"):
+            hull_box(junk, cameras.tensors())
+    with pytest.raises(ShapeError, match="hull_box: cameras"):
+        hull_box(list(masks), select(cameras.tensors(), 0, 0))
 
 
 def test_bad_input_is_refused():
@@ -241,6 +246,7 @@ def test_bad_input_is_refused():
         ({"masks": [masks, masks]}, ShapeError),
         ({"masks": []}, DTypeError),
         ({"masks": masks.long()}, DTypeError),
+        ({"masks": masks * float("nan")}, OptionError),
         ({"masks": None}, DTypeError),
         ({"grid": 3}, DTypeError),
         ({"grid": VoxelGrid(4, world_from_grid=torch.eye(4).repeat(2, 1, 1))}, ShapeError),

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lsmgeo.cameras import CameraTensors, rays, select
+from lsmgeo.cameras import CameraTensors, select
+from lsmgeo.classical.reconstruct import points_of
 from lsmgeo.data import Batch
 from lsmgeo.data.sample import first_views
 from lsmgeo.errors import OptionError
@@ -113,12 +114,8 @@ def joint_cloud(depth: Tensor, images: Tensor, cameras: CameraTensors) -> tuple[
     """
     positions, colours = [], []
     for view, one in enumerate(depth):
-        camera = select(cameras, 0, view)
-        origin, directions = rays(camera, tuple(one.shape))
-        forward = camera.cam_from_world[2, :3]
         there = one > 0
-        along = directions[there].double()
-        positions.append(origin.double() + along * (one[there].double() / (along @ forward.double()))[:, None])
+        positions.append(points_of(one, select(cameras, 0, view))[there])
         colours.append((images[view].permute(1, 2, 0)[there].clamp(0, 1) * 255).round().byte())
     return torch.cat(positions).numpy(), torch.cat(colours).numpy()
 

@@ -67,7 +67,7 @@ def state(experiment: Experiment, folder: Path) -> str:
     """How far a run is: "done", also where its results are committed, the step that it has come to, or nothing."""
     from benchmarks.experiments.collecting import RESULTS
     from benchmarks.experiments.running import Folder
-    from lsmgeo.models.run_folders import checkpoint_folders
+    from lsmgeo.models.weights import checkpoint_folders
 
     runs = Folder(folder)
     if (RESULTS / f"{experiment.name}.json").is_file() or runs.is_done(experiment):

@@ -24,7 +24,7 @@ from lsmgeo.metrics import DepthError, VoxelIoU
 from lsmgeo.models import Model, evaluation, load, training
 from lsmgeo.models.evaluation.report import finite
 from lsmgeo.models.evaluation.shapes import SizedShapes, batches
-from lsmgeo.models.training.checkpoints import load_checkpoint
+from lsmgeo.models.training.checkpoints import load_latest
 from lsmgeo.models.training.evaluating import evaluate_model
 from lsmgeo.models.training.feeding import Need, open_shapes, validation_batches
 from lsmgeo.models.training.signals import StopRequest
@@ -94,7 +94,7 @@ def run_experiment(experiment: Experiment, folder: Folder) -> int:
         "validation": validation,
         "evaluation": evaluate_test(experiment, model, validation, folder) if experiment.is_tested else {},
         "cpu_minutes": {
-            "training": round(load_checkpoint(path).part("place")["cpu_seconds"] / 60, 2),
+            "training": round(load_latest(path).part("place")["cpu_seconds"] / 60, 2),
             "evaluation": round((time.process_time() - begun) / 60, 2),
         },
     }

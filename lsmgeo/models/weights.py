@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
+import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import safetensors
 import safetensors.torch
@@ -27,33 +27,43 @@ from lsmgeo.data.files import read_bytes, write_atomic
 from lsmgeo.errors import CheckpointError, DataError, LsmGeoError, OptionError
 from lsmgeo.models.creating import from_settings, settings_of
 from lsmgeo.models.model import Model
-from lsmgeo.models.run_folders import WEIGHTS, checkpoint_folders
 
 __all__ = [
+    "CHECKPOINTS",
+    "STEP",
+    "WEIGHTS",
+    "NewerFormatError",
     "Weights",
+    "checkpoint_folders",
+    "checksum",
     "encode_weights",
     "fill_model",
     "load",
+    "newest_checkpoint",
     "parse_weights",
     "read_file",
     "read_weights",
+    "step_folder",
+    "tensors_of",
     "write_weights",
 ]
+
+# Where a run keeps its checkpoints: RUN/checkpoints/step_00000100/{model.safetensors, state.pt, meta.json}.
+CHECKPOINTS = "checkpoints"
+WEIGHTS = "model.safetensors"
+# ".old": a checkpoint that was about to be replaced when the process was killed.
+STEP = re.compile(r"step_(\d{8,18})(\.old-\d+)?")
 
 FORMAT = "lsmgeo-weights-1"
 MAX_FILE_BYTES = 1 << 34
 MAX_HEADER_BYTES = 1 << 22
 MAX_TENSORS = 10_000
 DTYPES = {
-    "F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16, "I64": torch.int64,
-    "I32": torch.int32, "U8": torch.uint8, "BOOL": torch.bool,
+    torch.float64: "F64", torch.float32: "F32", torch.float16: "F16", torch.bfloat16: "BF16", torch.int64: "I64",
+    torch.int32: "I32", torch.uint8: "U8", torch.bool: "BOOL",
 }  # fmt: skip
-# What gives a parameter its first values.
-STARTING = {
-    "add_", "clamp_", "constant_", "copy_", "erfinv_", "fill_", "kaiming_normal_", "kaiming_uniform_", "mul_",
-    "normal_", "uniform_", "zero_",
-}  # fmt: skip
-NAMES = {dtype: name for name, dtype in DTYPES.items()}
+
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,19 +160,74 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
         return _read(path)
     if (path / WEIGHTS).is_file():
         return _read(path / WEIGHTS)
-    damaged: list[CheckpointError] = []
+    weights = newest_checkpoint(path, lambda folder: _read(folder / WEIGHTS))
+    if weights is None:
+        raise CheckpointError(path, f"holds neither {WEIGHTS} nor a checkpoint")
+    return weights
+
+
+class NewerFormatError(CheckpointError):
+    """No damage: falling back would throw a newer version's work away."""
+
+
+def newest_checkpoint(path: Path, read: Callable[[Path], Found], problems: Sequence[str] = ()) -> Found | None:
+    """The newest checkpoint of a run that can be read; if that is not the newest there is, a warning names both.
+
+    Args:
+        path: a run folder or its folder of checkpoints.
+        read: reads and verifies the checkpoint in a folder.
+        problems: what is known to be wrong already.
+
+    Returns:
+        What `read` gives, or None where nothing was ever saved.
+
+    Raises:
+        CheckpointError: there are checkpoints, and none verifies; or the newest is of a newer format.
+    """
+    problems = list(problems)
     for folder in checkpoint_folders(path).values():
         try:
-            weights = _read(folder / WEIGHTS)
+            found = read(folder)
+        except NewerFormatError:
+            raise
         except CheckpointError as error:
-            damaged.append(error)
+            problems.append(str(error))
             continue
-        if damaged:
-            warnings.warn(f"damaged: {'; '.join(map(str, damaged))}. Going back to {folder}", stacklevel=2)
-        return weights
-    if damaged:
-        raise CheckpointError(path, f"no checkpoint verifies; the newest: {damaged[0]}")
-    raise CheckpointError(path, f"holds neither {WEIGHTS} nor a checkpoint")
+        if problems:
+            warnings.warn(f"{'; '.join(problems)}. Going back to {folder}", stacklevel=3)
+        return found
+    if problems:
+        raise CheckpointError(path, f"no checkpoint verifies: {'; '.join(problems)}")
+    return None
+
+
+def step_folder(step: int) -> str:
+    """The name of a step's checkpoint.
+
+    Args:
+        step: its number.
+
+    Example:
+        >>> step_folder(100)
+        'step_00000100'
+    """
+    return f"step_{step:08d}"
+
+
+def checkpoint_folders(path: Path) -> dict[int, Path]:
+    """The finished checkpoints in a run folder, or in its folder of checkpoints, by step, the newest first.
+
+    Args:
+        path: either folder; it need not exist.
+    """
+    folder = path / CHECKPOINTS if (path / CHECKPOINTS).is_dir() else path
+    found: dict[int, Path] = {}
+    # The longer names first: a checkpoint wins over the one that it replaces.
+    for item in sorted(folder.glob("step_*"), key=lambda item: -len(item.name)):
+        match = STEP.fullmatch(item.name)
+        if match and item.is_dir():
+            found[int(match[1])] = item
+    return dict(sorted(found.items(), reverse=True))
 
 
 def encode_weights(model: nn.Module, *, about: Mapping[str, Any] | None = None, half: bool = False) -> bytes:
@@ -179,18 +244,23 @@ def encode_weights(model: nn.Module, *, about: Mapping[str, Any] | None = None, 
     Raises:
         OptionError: notes that JSON cannot hold; with `half`, a weight that overflows float16.
     """
-    tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in model.state_dict().items()}
+    tensors = tensors_of(model)
     if check_flag("write_weights", "half", half):
         tensors = {name: tensor.half() if tensor.dtype == torch.float32 else tensor for name, tensor in tensors.items()}
         if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
             raise OptionError("write_weights: half must be False for weights that are not finite in float16")
     try:
-        notes = {name: json.dumps(value, allow_nan=False) for name, value in (("about", dict(about or {})),)}
+        notes = json.dumps(dict(about or {}), allow_nan=False)
     except (TypeError, ValueError) as error:
         raise OptionError(f"write_weights: about must consist of what JSON has; {error}") from error
-    metadata = {"format": FORMAT, "settings": json.dumps(settings_of(model)), **notes}
-    metadata["sha256"] = _checksum(metadata, tensors)
+    metadata = {"format": FORMAT, "settings": json.dumps(settings_of(model)), "about": notes}
+    metadata["sha256"] = checksum(metadata, tensors)
     return safetensors.torch.save(tensors, metadata)
+
+
+def tensors_of(model: nn.Module) -> dict[str, Tensor]:
+    """Copies of a model's parameters and buffers by name, on the CPU, each contiguous."""
+    return {name: tensor.detach().cpu().contiguous().clone() for name, tensor in model.state_dict().items()}
 
 
 def parse_weights(content: bytes, path: Path) -> Weights:
@@ -206,15 +276,23 @@ def parse_weights(content: bytes, path: Path) -> Weights:
     Raises:
         CheckpointError: it is no such file, or damaged.
     """
-    metadata = _check_header(content, path)
+    length = int.from_bytes(content[:8], "little")
+    if len(content) < 8 or length > min(len(content) - 8, MAX_HEADER_BYTES):
+        raise CheckpointError(path, "is not a whole file of weights (safetensors)")
     try:
+        header = json.loads(content[8 : 8 + length])
+        metadata = header.pop("__metadata__")
+        if metadata["format"] != FORMAT:
+            raise CheckpointError(path, f"is of format {metadata['format'][:64]!r}; this version reads {FORMAT!r}")
+        if len(header) > MAX_TENSORS:
+            raise CheckpointError(path, f"holds {len(header)} tensors, the limit is {MAX_TENSORS}")
+        # It refuses tensors that do not lie where their shapes say, one after the other to the end of the file.
         tensors = safetensors.torch.load(content)
         settings, about = json.loads(metadata["settings"]), json.loads(metadata["about"])
-    except (safetensors.SafetensorError, ValueError, KeyError, RecursionError) as error:
-        raise CheckpointError(path, f"is damaged ({str(error)[:200]})") from error
-    found = metadata.pop("sha256", None)
-    if found != _checksum(metadata, tensors):
-        raise CheckpointError(path, "is damaged: its SHA-256 is not the one that was saved")
+        if metadata.pop("sha256") != checksum(metadata, tensors):
+            raise CheckpointError(path, "is damaged: its SHA-256 is not the one that was saved")
+    except (safetensors.SafetensorError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise CheckpointError(path, f"is damaged, or no file of weights ({str(error)[:200]})") from error
     if not isinstance(settings, dict) or not isinstance(about, dict):
         raise CheckpointError(path, "holds settings that are none")
     return Weights(path, settings, about, tensors)
@@ -269,7 +347,7 @@ class _WithoutMemory(TorchFunctionMode):
         options = dict(kwargs or {})
         if func is torch.empty:
             options["device"] = "meta"
-        elif getattr(func, "__name__", "") in STARTING:
+        elif re.fullmatch("[a-z]\\w*_", getattr(func, "__name__", "")):  # gives a parameter its first values
             target = args[0] if args else options["tensor"]
             if target.is_meta:
                 return target
@@ -293,44 +371,11 @@ def _describe(tensor: Tensor, dtype: torch.dtype | None = None) -> str:
     return f"{tuple(tensor.shape)} {str(dtype or tensor.dtype).removeprefix('torch.')}"
 
 
-def _checksum(metadata: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
+def checksum(metadata: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 of notes and tensors, contiguous and on the CPU, with their names, dtypes and shapes."""
     digest = hashlib.sha256(json.dumps(dict(metadata), sort_keys=True).encode())
     for name, tensor in sorted(tensors.items()):
-        digest.update(json.dumps([name, NAMES[tensor.dtype], list(tensor.shape)]).encode())
+        digest.update(json.dumps([name, DTYPES[tensor.dtype], list(tensor.shape)]).encode())
         # Reinterpreted as bytes: numpy has no bfloat16.
         digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-def _check_header(content: bytes, path: Path) -> dict[str, str]:
-    """The metadata, once the header is bounded and every tensor lies where its shape says, one after the other."""
-    length = int.from_bytes(content[:8], "little")
-    if len(content) < 8 or length > min(len(content) - 8, MAX_HEADER_BYTES):
-        raise CheckpointError(path, "is not a whole file of weights (safetensors)")
-    try:
-        header = json.loads(content[8 : 8 + length])
-        metadata = header.pop("__metadata__")
-        if metadata["format"] != FORMAT:
-            raise CheckpointError(path, f"is of format {metadata['format'][:64]!r}; this version reads {FORMAT!r}")
-        if len(header) > MAX_TENSORS:
-            raise CheckpointError(path, f"holds {len(header)} tensors, the limit is {MAX_TENSORS}")
-        end = 0
-        for begin, stop, size in sorted(_extent(entry) for entry in header.values()):
-            if begin != end or stop != begin + size:
-                raise ValueError("tensors overlap or leave gaps")
-            end = stop
-        if end != len(content) - 8 - length:
-            raise ValueError("tensors do not fill the file")
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise CheckpointError(path, f"is not a file of weights ({str(error)[:200]})") from error
-    if not all(isinstance(value, str) for value in metadata.values()):
-        raise CheckpointError(path, "is not a file of weights (its metadata is no text)")
-    return metadata
-
-
-def _extent(entry: Mapping[str, Any]) -> tuple[int, int, int]:
-    shape, (begin, stop) = entry["shape"], entry["data_offsets"]
-    numbers = [*shape, begin, stop]
-    if len(shape) > 8 or not all(isinstance(number, int) and 0 <= number < 1 << 40 for number in numbers):
-        raise ValueError("a shape or an offset is none")
-    return begin, stop, math.prod(shape) * DTYPES[entry["dtype"]].itemsize

@@ -12,7 +12,7 @@ import pytest
 from lsmgeo import cli
 from lsmgeo.models import load
 from lsmgeo.models.training import loop
-from lsmgeo.models.training.checkpoints import load_checkpoint
+from lsmgeo.models.training.checkpoints import load_latest
 from tests.models.training.runs import configure, write_shapes
 
 
@@ -55,7 +55,7 @@ def test_a_signal_is_told_by_the_exit_status(configuration, tmp_path, capsys, mo
     monkeypatch.setattr(loop, "find_gradients", find_gradients)
     assert cli.main(["train", str(configuration), "--out", str(tmp_path)]) == status
     assert "go on:       the same command" in capsys.readouterr().out
-    assert load_checkpoint(tmp_path).step == 1
+    assert load_latest(tmp_path).step == 1
 
 
 @pytest.mark.parametrize(

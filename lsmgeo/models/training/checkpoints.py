@@ -25,12 +25,22 @@ from torch import Tensor, nn
 import lsmgeo
 from lsmgeo._checks import check_whole
 from lsmgeo.errors import CheckpointError, OptionError
-from lsmgeo.models.run_folders import CHECKPOINTS, WEIGHTS, checkpoint_folders, step_folder
 from lsmgeo.models.training.durable import clear_leftovers, make_folder, put_file, put_folder, remove_folder
-from lsmgeo.models.training.revision import code_revision
-from lsmgeo.models.weights import Weights, encode_weights, fill_model, parse_weights, read_file
+from lsmgeo.models.weights import (
+    CHECKPOINTS,
+    STEP,
+    WEIGHTS,
+    NewerFormatError,
+    Weights,
+    checkpoint_folders,
+    encode_weights,
+    newest_checkpoint,
+    parse_weights,
+    read_file,
+    step_folder,
+)
 
-__all__ = ["Checkpoint", "check_config", "load_checkpoint", "load_latest", "save_checkpoint"]
+__all__ = ["Checkpoint", "check_config", "load_latest", "save_checkpoint"]
 
 FORMAT = 1
 LATEST = "LATEST"
@@ -49,7 +59,7 @@ class Checkpoint:
         config: the configuration of the run that saved it.
         best: the step of the best checkpoint at that time, if any was called that.
         weights: the model's tensors, and the settings that the model is made from.
-        state: everything else by name: optimiser, schedule, sampler, random numbers, ...
+        state: everything else by name: optimiser, guard, place of the run, ...
     """
 
     path: Path
@@ -91,17 +101,6 @@ class Checkpoint:
         except (KeyError, ValueError, TypeError, IndexError, AttributeError, RuntimeError) as error:
             reason = f"missing key {error}" if isinstance(error, KeyError) else str(error)
             raise CheckpointError(self.path, f"{name} does not fit this run: {reason}") from error
-
-    def restore_model(self, model: nn.Module) -> None:
-        """Copy the weights into a model.
-
-        Args:
-            model: of the same settings as the one that was saved.
-
-        Raises:
-            CheckpointError: a tensor is missing, too many, or of another shape or dtype; the message names it.
-        """
-        fill_model(model, self.weights)
 
 
 def save_checkpoint(
@@ -159,33 +158,11 @@ def save_checkpoint(
     return final
 
 
-def load_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
-    """Read and verify a checkpoint.
-
-    Args:
-        path: a checkpoint; or a run folder or its folder of checkpoints, for the newest one that verifies. If that is
-            not the newest that is there, a warning names both.
-
-    Returns:
-        The checkpoint.
-
-    Raises:
-        CheckpointError: there is none, all are damaged, or it is of a newer format.
-    """
-    path = Path(path)
-    if (path / META).is_file():
-        return _read(path)
-    checkpoint = load_latest(path)
-    if checkpoint is None:
-        raise CheckpointError(path, "holds no checkpoint")
-    return checkpoint
-
-
 def load_latest(path: str | os.PathLike[str]) -> Checkpoint | None:
-    """Read the newest checkpoint that verifies; if that is not the newest that is there, a warning names both.
+    """Read and verify a checkpoint, or the newest one that verifies; a warning names those of later steps.
 
     Args:
-        path: a run folder or its folder of checkpoints.
+        path: a checkpoint, a run folder or its folder of checkpoints.
 
     Returns:
         The checkpoint, or None where nothing was ever saved.
@@ -194,26 +171,13 @@ def load_latest(path: str | os.PathLike[str]) -> Checkpoint | None:
         CheckpointError: there are checkpoints, and none verifies; or the newest is of a newer format.
     """
     path = Path(path)
-    folders = checkpoint_folders(path)
+    if (path / META).is_file():
+        return _read(path)
     problems = []
-    if missing := _missing(path / CHECKPOINTS if (path / CHECKPOINTS).is_dir() else path, max(folders, default=-1)):
+    newest = max(checkpoint_folders(path), default=-1)
+    if missing := _missing(path / CHECKPOINTS if (path / CHECKPOINTS).is_dir() else path, newest):
         problems.append(f"{missing}: is missing, and {LATEST} names it")
-    for step, folder in folders.items():
-        try:
-            checkpoint = _read(folder)
-            if checkpoint.step != step:
-                raise CheckpointError(folder, f"is the checkpoint of step {checkpoint.step}, as its {META} says")
-        except _NewerFormatError:
-            raise
-        except CheckpointError as error:
-            problems.append(str(error))
-            continue
-        if problems:
-            warnings.warn(f"{'; '.join(problems)}. Going back to {folder}", stacklevel=2)
-        return checkpoint
-    if problems:
-        raise CheckpointError(path, f"no checkpoint verifies: {'; '.join(problems)}")
-    return None
+    return newest_checkpoint(path, _read, problems)
 
 
 def check_config(checkpoint: Checkpoint, config: Mapping[str, Any], *, free: Collection[str] = ()) -> None:
@@ -222,7 +186,7 @@ def check_config(checkpoint: Checkpoint, config: Mapping[str, Any], *, free: Col
     Args:
         checkpoint: what to resume from.
         config: of the resuming run, as for `save_checkpoint`.
-        free: dotted names of what may differ, for example "run.steps"; a name of a section frees all of it.
+        free: dotted names of what may differ, for example "run.steps".
 
     Raises:
         CheckpointError: another value is different, missing or new; the message names the first.
@@ -230,15 +194,9 @@ def check_config(checkpoint: Checkpoint, config: Mapping[str, Any], *, free: Col
     # What JSON makes of it (lists of tuples) is what the checkpoint holds.
     before, now = dict(_leaves(checkpoint.config)), dict(_leaves(json.loads(_canonical(config))))
     for key in sorted(before.keys() | now.keys()):
-        if any(key == name or key.startswith(name + ".") for name in free):
-            continue
         was, is_now = before.get(key, "missing"), now.get(key, "missing")
-        if was != is_now:
+        if was != is_now and key not in free:
             raise CheckpointError(checkpoint.path, f"belongs to another run: {key} was {was!r} and is {is_now!r} now")
-
-
-class _NewerFormatError(CheckpointError):
-    """No damage: falling back would throw a newer version's work away."""
 
 
 def _encode_state(state: Mapping[str, Any]) -> bytes:
@@ -254,7 +212,6 @@ def _encode_state(state: Mapping[str, Any]) -> bytes:
 
 
 def _encode_meta(files: Mapping[str, bytes], step: int, config: Mapping[str, Any], best: int | None) -> bytes:
-    canonical = _canonical(config)
     meta = {
         "format": FORMAT,
         "step": step,
@@ -263,9 +220,8 @@ def _encode_meta(files: Mapping[str, bytes], step: int, config: Mapping[str, Any
             name: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
             for name, content in files.items()
         },
-        "config": json.loads(canonical),
-        "config_sha256": hashlib.sha256(canonical.encode()).hexdigest(),
-        "versions": {"lsmgeo": lsmgeo.__version__, "git": code_revision(), "torch": torch.__version__},
+        "config": json.loads(_canonical(config)),
+        "versions": {"lsmgeo": lsmgeo.__version__, "torch": torch.__version__},
         "saved_at": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
     meta["sha256"] = hashlib.sha256(_canonical(meta).encode()).hexdigest()
@@ -300,6 +256,9 @@ def _read(folder: Path) -> Checkpoint:
         raise CheckpointError(folder / STATE, f"cannot be read ({str(error)[:400]})") from error
     if not isinstance(state, dict):
         raise CheckpointError(folder / STATE, f"holds no state but {type(state).__name__}")
+    match = STEP.fullmatch(folder.name)
+    if match and int(match[1]) != step:
+        raise CheckpointError(folder, f"is the checkpoint of step {step}, as its {META} says")
     return Checkpoint(folder, step, config, best, weights, state)
 
 
@@ -316,7 +275,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
     version = meta.get("format")
     if isinstance(version, int) and version > FORMAT and (is_whole or found is None):
         reason = f"is of format {version}, made by a newer lsmgeo; this one reads up to {FORMAT}"
-        raise _NewerFormatError(path, reason)
+        raise NewerFormatError(path, reason)
     if not is_whole:
         raise CheckpointError(path, "is damaged: its SHA-256 is not the one that was saved")
     return meta

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.data import Batch, Sample
 from lsmgeo.metrics import DepthError, VoxelIoU
 from lsmgeo.models.losses import sum_loss
+from lsmgeo.models.machine import evaluating
 from lsmgeo.models.training.pictures import Example
 from lsmgeo.models.training.processes import any_true, gather
 from lsmgeo.models.training.signals import StopRequest
@@ -68,7 +69,6 @@ class Evaluation:
         return {self.measure: self.by_view, "per_category": self.categories, "loss": self.loss}
 
 
-@torch.no_grad()
 def evaluate_model(
     model: nn.Module, batches: Iterator[Batch], stop: StopRequest, *, region: str, loss: str, pictures: int
 ) -> Evaluation | None:
@@ -89,9 +89,7 @@ def evaluate_model(
     total = count = 0.0
     examples: list[Example] = []
     kind = "iou"
-    was_training = model.training
-    model.eval()
-    try:
+    with evaluating(model):
         for batch in batches:
             if stop:
                 break
@@ -111,8 +109,6 @@ def evaluate_model(
                     measure.update(predicted[:, view], batch.depth, names, batch.mask)
             for index in range(min(pictures - len(examples), len(predicted))):
                 examples.append(Example(_sample(batch, index), predicted[index].cpu()))
-    finally:
-        model.train(was_training)
     if any_true(bool(stop)):
         return None
     parts = gather((measures, total, count, kind))
@@ -132,13 +128,10 @@ def evaluate_model(
 
 def _sample(batch: Batch, index: int) -> Sample:
     """One shape of a batch, on the CPU."""
-    return Sample(
-        batch.images[index].cpu(),
-        CameraTensors(*(torch.as_tensor(value)[index].cpu() for value in batch.cameras)),
-        None if batch.depth is None else batch.depth[index].cpu(),
-        None if batch.mask is None else batch.mask[index].cpu(),
-        None if batch.occupancy is None else batch.occupancy[index].cpu(),
-        batch.mesh[index],
-        batch.category[index],
-        batch.name[index],
-    )
+
+    def pick(field: Any) -> Any:
+        if isinstance(field, CameraTensors):
+            return CameraTensors(*(torch.as_tensor(value)[index].cpu() for value in field))
+        return field[index].cpu() if isinstance(field, Tensor) else field and field[index]
+
+    return Sample(*map(pick, batch[:-1]))

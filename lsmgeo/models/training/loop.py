@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import signal
 import time
 import warnings
 from collections.abc import Iterator
@@ -18,12 +17,11 @@ from typing import TYPE_CHECKING, Any
 from lsmgeo.data import Batch, write_atomic
 from lsmgeo.errors import CheckpointError, TrainingError
 from lsmgeo.models.creating import settings_of
-from lsmgeo.models.run_folders import CHECKPOINTS, step_folder
-from lsmgeo.models.training.checkpoints import check_config, load_latest, save_checkpoint
+from lsmgeo.models.training.checkpoints import Checkpoint, check_config, load_latest, save_checkpoint
 from lsmgeo.models.training.config import TrainingConfig
 from lsmgeo.models.training.evaluating import Evaluation, evaluate_model
 from lsmgeo.models.training.feeding import Need, open_shapes, training_batches, validation_batches
-from lsmgeo.models.training.guard import StepGuard, are_finite
+from lsmgeo.models.training.guard import StepGuard
 from lsmgeo.models.training.logs import RunLog
 from lsmgeo.models.training.optimising import (
     TIMED_STEPS,
@@ -34,9 +32,9 @@ from lsmgeo.models.training.optimising import (
     move_parameters,
 )
 from lsmgeo.models.training.processes import any_true, check_agreement, gather
-from lsmgeo.models.training.randomness import random_state, restore_random_state
 from lsmgeo.models.training.signals import StopRequest, catch_stop
-from lsmgeo.models.training.starting import decided, hold_folder, make_model, parameter_checksum, started
+from lsmgeo.models.training.starting import decided, hold_folder, make_model, started
+from lsmgeo.models.weights import CHECKPOINTS, checksum, fill_model, step_folder, tensors_of
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -109,26 +107,32 @@ def train(config: TrainingConfig, out: str | os.PathLike[str], *, quiet: bool = 
         TrainingError: losses or gradients were not finite, again and again; processes do not start from the same; or
             another process trains in the folder.
     """
-    config = decided(config, Path(out))
+    folder = Path(out)
+    checkpoint = load_latest(folder)
+    config = decided(config, checkpoint)
     # One layer of the release never gets a gradient, and what convolves the state gets none from a single view.
     has_idle_parameters = (
         config.model.variant == "release" or config.data.view_range[0] == 1 or config.run.loss_views == "random"
     )
     with (
         started(config.run, has_idle_parameters=has_idle_parameters) as accelerator,
-        hold_folder(Path(out)) if accelerator.is_main_process else contextlib.nullcontext(),
-        catch_stop((signal.SIGTERM, signal.SIGINT)) as stop,
+        catch_stop() as stop,
     ):
-        return _train(config, Path(out), accelerator, stop, quiet=quiet)
+        return _train(config, folder, checkpoint, accelerator, stop, quiet=quiet)
 
 
 def _train(
-    config: TrainingConfig, folder: Path, accelerator: Accelerator, stop: StopRequest, *, quiet: bool
+    config: TrainingConfig,
+    folder: Path,
+    checkpoint: Checkpoint | None,
+    accelerator: Accelerator,
+    stop: StopRequest,
+    *,
+    quiet: bool,
 ) -> Trained:
     run, data = config.run, config.data
     device, rank, processes = accelerator.device, accelerator.process_index, accelerator.num_processes
 
-    checkpoint = load_latest(folder)
     # A run that goes on has its weights.
     beginning = config.model if checkpoint is None else replace(config.model, weights=None)
     model = make_model(beginning, run, device)
@@ -148,20 +152,18 @@ def _train(
     if checkpoint is not None:
         was_planned = checkpoint.config["run"]["steps"] is not None
         check_config(checkpoint, identity(), free=config.free() + (() if was_planned else ("run.steps",)))
-        checkpoint.restore_model(model)
+        fill_model(model, checkpoint.weights)
         checkpoint.restore("optimiser", optimiser)
         checkpoint.restore("guard", guard)
         if accelerator.scaler is not None:
             checkpoint.restore("scaler", accelerator.scaler)
-        restore_random_state(checkpoint.part("random"))
         place = Place(**checkpoint.part("place"))
         before = checkpoint.config["run"]
         if any(before[key] != getattr(run, key) for key in ("evaluate_shapes", "evaluate_views")):
             # What was measured on other shapes or views is no measure of what comes.
             place.best = place.best_value = None
-    check_agreement(
-        {"the configuration": identity(), "the step": place.step, "the parameters": parameter_checksum(model)}
-    )
+    parameters = checksum({}, tensors_of(model))[:16]
+    check_agreement({"the configuration": identity(), "the step": place.step, "the parameters": parameters})
 
     wrapped = accelerator.prepare_model(model)
     taken_a_step = run.batch * run.accumulation * processes
@@ -184,15 +186,8 @@ def _train(
     ended = ""
     begin, cpu_begin = time.monotonic() - place.seconds, time.process_time() - place.cpu_seconds
 
-    # Told before the work, not after.
     def write_config() -> None:
         write_atomic(folder / CONFIG, json.dumps(config.to_dict(), indent=1).encode())
-
-    if rank == 0:
-        write_config()
-    log = RunLog(
-        folder, step=place.step, steps=run.steps, is_writer=rank == 0, tensorboard=run.tensorboard, quiet=quiet
-    )
 
     def save(*, must: bool) -> None:
         nonlocal saved, saved_step
@@ -202,7 +197,6 @@ def _train(
             "optimiser": optimiser.state_dict(),
             "guard": guard.state_dict(),
             "scaler": None if accelerator.scaler is None else accelerator.scaler.state_dict(),
-            "random": random_state(),
             "sampler": {"epoch": epoch, "position": position, "seed": run.seed},
             "place": asdict(place),
         }
@@ -265,8 +259,17 @@ def _train(
         more = int(left / (step_seconds + evaluation_seconds / run.evaluate_every))
         return gather(place.step + max(1, more))[0]
 
-    # Closed whatever happens: the readers are deaf to the signals with which Python ends its children.
-    with log, contextlib.closing(batches):
+    # Nothing is written before all is found to fit. The readers are closed whatever happens: they are deaf to the
+    # signals with which Python ends its children.
+    with (
+        hold_folder(folder) if rank == 0 else contextlib.nullcontext(),
+        RunLog(
+            folder, step=place.step, steps=run.steps, is_writer=rank == 0, tensorboard=run.tensorboard, quiet=quiet
+        ) as log,
+        contextlib.closing(batches),
+    ):
+        if rank == 0:
+            write_config()
         log.event(
             "start" if checkpoint is None else "resume",
             step=place.step,
@@ -365,7 +368,7 @@ def _train(
                     shapes=names,
                 )
                 log.say(f"step {place.step}: the loss or the gradient is not finite; skipped")
-                is_scaled = accelerator.scaler is not None and are_finite(gradients.loss)
+                is_scaled = accelerator.scaler is not None and isfinite(gradients.loss)
                 scale = accelerator.scaler.get_scale() if is_scaled else None
                 try:
                     guard.admits(place.step, is_bad=True, names=names, scale=scale)

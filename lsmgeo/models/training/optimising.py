@@ -7,14 +7,13 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 from torch import distributed, nn
 
 from lsmgeo.data import Batch
 from lsmgeo.models.losses import sum_loss
 from lsmgeo.models.training.config import OptimiserConfig, RunConfig
-from lsmgeo.models.training.guard import are_finite
-from lsmgeo.models.training.randomness import seeded_generator
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -50,7 +49,7 @@ class Gradients(NamedTuple):
     @property
     def is_finite(self) -> bool:
         """Whether the parameters may follow it; the same in all processes, as loss and norm are."""
-        return are_finite(self.loss, self.norm)
+        return math.isfinite(self.loss) and math.isfinite(self.norm)
 
 
 def make_optimiser(model: nn.Module, config: OptimiserConfig) -> torch.optim.Optimizer:
@@ -169,5 +168,7 @@ def loss_steps(run: RunConfig, step: int, views: int) -> Steps:
         return None
     if run.loss_views == "last":
         return "last"
-    drawn = torch.randint(views, (1,), generator=seeded_generator(run.seed, step, 0x76696577))
-    return [int(drawn)]
+    # From the seed and the step alone, so that no state of a generator need be saved.
+    state = np.random.SeedSequence([2, run.seed, step, 0x76696577]).generate_state(1, np.uint64)
+    generator = torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
+    return [int(torch.randint(views, (1,), generator=generator))]

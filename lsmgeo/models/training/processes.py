@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TypeVar
 
-import torch
 from torch import distributed
 
 from lsmgeo.errors import TrainingError
@@ -21,13 +20,7 @@ def any_true(flag: bool) -> bool:
     Args:
         flag: this process's.
     """
-    if not _is_distributed():
-        return flag
-    # NCCL moves no memory of the host.
-    device = torch.device("cuda", torch.cuda.current_device()) if distributed.get_backend() == "nccl" else "cpu"
-    reduced = torch.tensor([int(flag)], dtype=torch.int32, device=device)
-    distributed.all_reduce(reduced, distributed.ReduceOp.MAX)
-    return bool(reduced.item())
+    return any(gather(flag))
 
 
 def gather(value: Value) -> list[Value]:
@@ -36,7 +29,7 @@ def gather(value: Value) -> list[Value]:
     Args:
         value: this process's: numbers, strings, tensors and containers of them.
     """
-    if not _is_distributed():
+    if not (distributed.is_available() and distributed.is_initialized()):
         return [value]
     values: list[Value | None] = [None] * distributed.get_world_size()
     distributed.all_gather_object(values, value)
@@ -57,7 +50,3 @@ def check_agreement(things: Mapping[str, object]) -> None:
             if things.get(name) != others.get(name):
                 own, other = things.get(name), others.get(name)
                 raise TrainingError(f"processes do not agree: {name} is {own!r} here and {other!r} in process {rank}")
-
-
-def _is_distributed() -> bool:
-    return distributed.is_available() and distributed.is_initialized()

@@ -6,11 +6,9 @@ import contextlib
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from types import FrameType
 from typing import TypeVar
-
-from lsmgeo.models.training.processes import any_true
 
 __all__ = ["StopRequest", "catch_stop", "ignore_stop"]
 
@@ -31,10 +29,6 @@ class StopRequest:
     def exit_code(self) -> int:
         """What the process should end with: 128 plus the signal's number, 143 for SIGTERM; 0 if none came."""
         return 0 if self.signal is None else 128 + self.signal
-
-    def is_agreed(self) -> bool:
-        """Whether any process of the run was asked to stop. All processes must call this together."""
-        return any_true(bool(self))
 
     def next_item(self, items: Iterator[Item]) -> Item | None:
         """The next of ``items``, or None as soon as a stop is asked for, however long the item would take.
@@ -74,15 +68,12 @@ class _Asked(BaseException):
 
 
 @contextlib.contextmanager
-def catch_stop(signals: Sequence[int] = (signal.SIGTERM,)) -> Iterator[StopRequest]:
-    """Inside this context the first signal only sets a flag; the same signal again ends the process at once.
+def catch_stop() -> Iterator[StopRequest]:
+    """Inside this context the first SIGTERM or SIGINT only sets a flag; the same again ends the process at once.
 
     The flag is to be looked at wherever training spends time: between steps, between the batches of an evaluation,
     after a checkpoint, and while waiting for data (`StopRequest.next_item`). The handlers from before come back at the
     end. Outside the main thread, where Python allows no handlers, the flag stays unset.
-
-    Args:
-        signals: which ones.
 
     Yields:
         The flag; it is true once a signal has come.
@@ -97,7 +88,7 @@ def catch_stop(signals: Sequence[int] = (signal.SIGTERM,)) -> Iterator[StopReque
     before = {}
     try:
         if threading.current_thread() is threading.main_thread():
-            for number in signals:
+            for number in (signal.SIGTERM, signal.SIGINT):
                 before[number] = signal.signal(number, request._handle)
         yield request
     finally:

@@ -3,44 +3,35 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import nn
 
-from lsmgeo.errors import CheckpointError, DataError, OptionError, TrainingError
+from lsmgeo.errors import DataError, OptionError, TrainingError
 from lsmgeo.models.creating import MODELS, create, settings_of
 from lsmgeo.models.model import Model
-from lsmgeo.models.training.checkpoints import load_latest
+from lsmgeo.models.training.checkpoints import Checkpoint
 from lsmgeo.models.training.config import ModelConfig, RunConfig, TrainingConfig
 from lsmgeo.models.weights import load
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
-__all__ = ["decided", "fast_precision", "hold_folder", "make_model", "parameter_checksum", "started"]
+__all__ = ["decided", "fast_precision", "hold_folder", "make_model", "started"]
 
 
-def decided(config: TrainingConfig, folder: Path) -> TrainingConfig:
+def decided(config: TrainingConfig, checkpoint: Checkpoint | None) -> TrainingConfig:
     """A configuration with what is left to the trainer filled in: as a run that goes on has it, else for this hardware.
 
     Args:
         config: of the run; precision may be "auto", `channels_last` None, `steps` None where `cpu_minutes` are given.
-        folder: the run's.
+        checkpoint: that the run goes on from, if any.
     """
     run = config.run
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the loop tells of damage
-            checkpoint = load_latest(folder)
-    except CheckpointError:
-        checkpoint = None
     before = {} if checkpoint is None else checkpoint.config.get("run", {})
     model: Any = MODELS.get(config.model.name)
     choices: dict[str, Any] = {}
@@ -140,13 +131,11 @@ def make_model(config: ModelConfig, run: RunConfig, device: torch.device) -> Mod
     model = create(config.name, preset=config.preset, variant=config.variant, **config.settings)
     if config.weights is not None:
         other = load(config.weights)
-        mine, theirs = settings_of(model), settings_of(other)
-        for key in mine:
-            if theirs.get(key) != mine[key]:
-                raise OptionError(
-                    f"model: weights are of another model: {key} is {theirs.get(key)!r} in {config.weights}, "
-                    f"{mine[key]!r} here"
-                )
+        theirs = settings_of(other)
+        for key, mine in settings_of(model).items():
+            if mine != theirs.get(key):
+                there = f"{key} is {theirs.get(key)!r} in {config.weights}, {mine!r} here"
+                raise OptionError(f"model: weights are of another model: {there}")
         model.load_state_dict(other.state_dict())
     model.to(device)
     if run.channels_last:
@@ -155,12 +144,3 @@ def make_model(config: ModelConfig, run: RunConfig, device: torch.device) -> Mod
             if parameter.dim() in formats:
                 parameter.data = parameter.data.contiguous(memory_format=formats[parameter.dim()])
     return model.train()
-
-
-def parameter_checksum(model: nn.Module) -> str:
-    """A hash of all parameters and buffers."""
-    digest = hashlib.sha256()
-    for name, tensor in sorted(model.state_dict().items()):
-        digest.update(name.encode())
-        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
-    return digest.hexdigest()[:16]

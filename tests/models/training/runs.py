@@ -23,7 +23,7 @@ from lsmgeo.models.training import (
     loop,
     train,
 )
-from lsmgeo.models.training.checkpoints import load_checkpoint
+from lsmgeo.models.training.checkpoints import load_latest
 
 SIZES = {"encoder_channels": (4, 4), "grid_channels": (4,), "feature_channels": 4, "hidden_channels": 4}
 TRAINING, HELD_BACK = 6, 2
@@ -80,7 +80,7 @@ def losses(folder: Path) -> dict[int, float | str]:
 
 def end_of(folder: Path) -> tuple[int, dict[str, Tensor], dict]:
     """Step, weights and optimiser's state at the end of a run."""
-    checkpoint = load_checkpoint(folder)
+    checkpoint = load_latest(folder)
     return checkpoint.step, dict(checkpoint.weights.tensors), checkpoint.part("optimiser")
 
 

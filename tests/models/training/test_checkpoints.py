@@ -19,8 +19,8 @@ import torch
 from lsmgeo.errors import CheckpointError, OptionError
 from lsmgeo.models import create, load
 from lsmgeo.models.training import checkpoints
-from lsmgeo.models.training.checkpoints import check_config, load_checkpoint, load_latest, save_checkpoint
-from lsmgeo.models.training.randomness import random_state, restore_random_state, seeded_generator
+from lsmgeo.models.training.checkpoints import check_config, load_latest, save_checkpoint
+from lsmgeo.models.weights import fill_model
 from tests.models.training.faults import Points, fill, in_child, kill, leftovers
 
 CONFIG = {"model": {"name": "voxel-lsm", "sizes": [1, 2]}, "run": {"batch": 4, "steps": 10}, "processes": 1}
@@ -28,31 +28,33 @@ FILES = ("model.safetensors", "state.pt", "meta.json")
 
 
 class Training:
-    """A model, its optimiser, and steps that only a good resume repeats."""
+    """A model, its optimiser, a generator, and steps that only a good resume repeats."""
 
     def __init__(self) -> None:
         torch.manual_seed(0)
         self.model = create("voxel-lsm", preset="tiny", encoder_channels=(4, 4), grid_channels=(4,), hidden_channels=4)
         self.optimiser = torch.optim.Adam(self.model.parameters(), lr=0.01)
+        self.generator = torch.Generator().manual_seed(0)
         self.step = 0
 
     def advance(self) -> float:
         self.step += 1
-        loss = sum((weights * torch.rand_like(weights)).sum() for weights in self.model.parameters())
+        factors = (torch.rand(weights.shape, generator=self.generator) for weights in self.model.parameters())
+        loss = sum((weights * by).sum() for weights, by in zip(self.model.parameters(), factors, strict=True))
         self.optimiser.zero_grad()
         loss.backward()
         self.optimiser.step()
         return loss.item()
 
     def save(self, folder: Path, **options) -> Path:
-        state = {"optimiser": self.optimiser.state_dict(), "random": random_state(), "best": None}
+        state = {"optimiser": self.optimiser.state_dict(), "generator": self.generator.get_state(), "best": None}
         return save_checkpoint(folder, self.step, model=self.model, state=state, config=CONFIG, **options)
 
     def resume(self, path: Path) -> None:
-        checkpoint = load_checkpoint(path)
-        checkpoint.restore_model(self.model)
+        checkpoint = load_latest(path)
+        fill_model(self.model, checkpoint.weights)
         checkpoint.restore("optimiser", self.optimiser)
-        restore_random_state(checkpoint.part("random"))
+        self.generator.set_state(checkpoint.part("generator"))
         self.step = checkpoint.step
 
 
@@ -90,7 +92,7 @@ def losses_from(path: Path) -> tuple[int, list[float]]:
 def assert_same(found: checkpoints.Checkpoint, expected: checkpoints.Checkpoint) -> None:
     torch.testing.assert_close(found.weights.tensors, expected.weights.tensors, rtol=0, atol=0)
     torch.testing.assert_close(found.part("optimiser"), expected.part("optimiser"), rtol=0, atol=0)
-    torch.testing.assert_close(found.part("random")["torch"], expected.part("random")["torch"], rtol=0, atol=0)
+    torch.testing.assert_close(found.part("generator"), expected.part("generator"), rtol=0, atol=0)
 
 
 def damage(path: Path, content: bytes) -> None:
@@ -101,18 +103,18 @@ def test_a_resumed_run_takes_the_same_steps(run, expected):
     begin, losses = losses_from(run)
     assert begin == 2
     assert losses == expected[2:4]
-    assert load_checkpoint(run / "checkpoints").step == load_checkpoint(run / "checkpoints" / "step_00000002").step == 2
+    assert load_latest(run / "checkpoints").step == load_latest(run / "checkpoints" / "step_00000002").step == 2
 
 
-@pytest.mark.parametrize("part", ["optimiser", "random"])
+@pytest.mark.parametrize("part", ["optimiser", "generator"])
 def test_each_part_of_the_state_matters(run, expected, part):
     """The comparison above can fail: what is not restored shows within two steps."""
-    training, checkpoint = Training(), load_checkpoint(run)
-    checkpoint.restore_model(training.model)
+    training, checkpoint = Training(), load_latest(run)
+    fill_model(training.model, checkpoint.weights)
     if part != "optimiser":
         checkpoint.restore("optimiser", training.optimiser)
-    if part != "random":
-        restore_random_state(checkpoint.part("random"))
+    if part != "generator":
+        training.generator.set_state(checkpoint.part("generator"))
     assert [training.advance(), training.advance()] != expected[2:4]
 
 
@@ -123,7 +125,7 @@ def test_the_last_ones_and_the_best_are_kept(tmp_path):
         training.save(tmp_path, keep=2, best=2 if step > 1 else None)
         assert (tmp_path / "LATEST").read_text() == f"step_{step:08d}\n"
     assert sorted(os.listdir(tmp_path)) == ["LATEST", "step_00000002", "step_00000005", "step_00000006"]
-    assert load_checkpoint(tmp_path).best == 2
+    assert load_latest(tmp_path).best == 2
     training.advance()
     training.save(tmp_path, keep=2, best=7)
     assert sorted(os.listdir(tmp_path)) == ["LATEST", "step_00000006", "step_00000007"]
@@ -142,8 +144,6 @@ def test_meta_tells_what_is_there(run):
 
 def test_nothing_saved_is_no_error_and_everything_lost_is_one(run, tmp_path):
     assert load_latest(tmp_path / "never") is None
-    with pytest.raises(CheckpointError, match="holds no checkpoint"):
-        load_checkpoint(tmp_path / "never")
     for step in (1, 2):
         shutil.rmtree(run / "checkpoints" / f"step_{step:08d}")
     with pytest.raises(CheckpointError, match=r"step_00000002: is missing, and LATEST names it"):
@@ -179,7 +179,7 @@ def test_a_kill_at_any_moment_of_a_save_leaves_the_old_or_the_new_one(run, third
     calls = count_points(third, run, tmp_path)
     assert len(calls) >= 30
     assert {"mkdir", "write", "fsync", "rename", "unlink"} <= set(calls)
-    whole = {2: load_checkpoint(run), 3: load_checkpoint(tmp_path / "counted")}
+    whole = {2: load_latest(run), 3: load_latest(tmp_path / "counted")}
     begins = []
     for at in range(len(calls)):
         copy = shutil.copytree(run, tmp_path / str(at))
@@ -306,14 +306,14 @@ def test_a_truncated_file_is_never_read(run, expected, name):
     for number, length in enumerate(np.linspace(0, len(content) - 1, 64).astype(int)):
         damage(path, content[:length])
         with pytest.raises(CheckpointError, match=name):
-            load_checkpoint(path.parent)
+            load_latest(path.parent)
         if number % 21:
             continue
         with pytest.warns(UserWarning, match=rf"step_00000002.{name}.* Going back to .*step_00000001"):
             assert load_latest(run).step == 1
     damage(path, content + b"\0")
     with pytest.raises(CheckpointError, match=name):
-        load_checkpoint(path.parent)
+        load_latest(path.parent)
     damage(path, content)
     assert losses_from(run) == (2, expected[2:4])
 
@@ -330,9 +330,9 @@ def test_a_flipped_bit_is_never_read(run, name, count):
         flipped[bit // 8] ^= 1 << bit % 8
         damage(path, bytes(flipped))
         with pytest.raises(CheckpointError):
-            load_checkpoint(path.parent)
+            load_latest(path.parent)
     damage(path, content)
-    assert load_checkpoint(path.parent).config == before["config"]
+    assert load_latest(path.parent).config == before["config"]
 
 
 def test_two_damaged_ones_are_both_named(run):
@@ -395,7 +395,7 @@ def test_a_checkpoint_that_lacks_something_is_refused(run, key):
     folder = run / "checkpoints" / "step_00000002"
     rewrite(folder, lambda meta: meta.pop(key))
     with pytest.raises(CheckpointError, match=f"lacks what a checkpoint needs .*{key}"):
-        load_checkpoint(folder)
+        load_latest(folder)
 
 
 @pytest.mark.parametrize(
@@ -411,31 +411,30 @@ def test_a_checkpoint_that_lacks_something_is_refused(run, key):
 )
 def test_another_run_is_refused_by_the_name_of_what_differs(run, change, match):
     with pytest.raises(CheckpointError, match=match):
-        check_config(load_checkpoint(run), {**CONFIG, **change}, free=("run.steps",))
+        check_config(load_latest(run), {**CONFIG, **change}, free=("run.steps",))
 
 
 def test_what_is_free_may_differ(run):
-    checkpoint = load_checkpoint(run)
+    checkpoint = load_latest(run)
     check_config(checkpoint, {**CONFIG, "model": {"name": "voxel-lsm", "sizes": (1, 2)}})
     check_config(checkpoint, {**CONFIG, "run": {"batch": 4, "steps": 20}}, free=("run.steps",))
-    check_config(checkpoint, {**CONFIG, "run": {"batch": 8, "steps": 20}}, free=("run",))
 
 
 def test_a_state_that_does_not_fit_is_refused_by_name(run):
-    checkpoint = load_checkpoint(run)
-    with pytest.raises(CheckpointError, match=r"state.pt has no 'scaler'; it has best, optimiser, random"):
+    checkpoint = load_latest(run)
+    with pytest.raises(CheckpointError, match=r"state.pt has no 'scaler'; it has best, generator, optimiser"):
         checkpoint.part("scaler")
     other = create("voxel-lsm", preset="tiny")
     with pytest.raises(CheckpointError, match=r"holds \S+ as \(4,\) float32; the model has \(8,\) float32"):
-        checkpoint.restore_model(other)
+        fill_model(other, checkpoint.weights)
     training = Training()
     parameters = [torch.nn.Parameter(torch.zeros(3, *weights.shape)) for weights in training.model.parameters()]
     with pytest.raises(CheckpointError, match=r"optimiser does not fit this run: exp_avg of parameter 0 is"):
         checkpoint.restore("optimiser", torch.optim.Adam(parameters))
     with pytest.raises(CheckpointError, match="optimiser does not fit this run"):
         checkpoint.restore("optimiser", torch.optim.Adam(parameters[:2]))
-    with pytest.raises(CheckpointError, match="random does not fit this run: missing key 'state'"):
-        checkpoint.restore("random", training.optimiser)
+    with pytest.raises(CheckpointError, match="generator does not fit this run"):
+        checkpoint.restore("generator", training.optimiser)
 
 
 def test_what_cannot_be_read_back_is_not_saved(tmp_path):
@@ -460,38 +459,5 @@ def test_code_in_a_state_is_not_run(run, tmp_path):
     entry = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
     rewrite(folder, lambda meta: meta["files"].update({"state.pt": entry}))
     with pytest.raises(CheckpointError, match=r"state.pt: cannot be read"):
-        load_checkpoint(folder)
+        load_latest(folder)
     assert not (tmp_path / "ran").exists()
-
-
-def test_random_numbers_go_on_where_they_were():
-    state = random_state()
-    expected = [torch.rand(3).tolist(), random.random(), random.gauss(), np.random.rand(3).tolist()]  # noqa: NPY002
-    restore_random_state(state)
-    again = [torch.rand(3).tolist(), random.random(), random.gauss(), np.random.rand(3).tolist()]  # noqa: NPY002
-    assert again == expected
-
-
-def test_seeded_generators_follow_from_their_place():
-    drawn = {torch.rand(1, generator=seeded_generator(*place)).item() for place in [(0, 1), (0, 2), (1, 1), (0, 1, 0)]}
-    assert len(drawn) == 4
-    assert torch.rand(1, generator=seeded_generator(0, 1)).item() in drawn
-
-
-def test_the_revision_is_that_of_the_checkout(tmp_path, monkeypatch):
-    from lsmgeo.models.training import revision
-
-    git, commit = tmp_path / ".git", "c0ffee" + 34 * "0"
-    (git / "refs" / "heads").mkdir(parents=True)
-    monkeypatch.setattr(revision.lsmgeo, "__file__", str(tmp_path / "lsmgeo" / "__init__.py"))
-    found = revision.code_revision.__wrapped__
-    assert found() is None
-    (git / "HEAD").write_text("ref: refs/heads/main\n")
-    assert found() is None
-    (git / "packed-refs").write_text(f"# pack-refs\n{commit} refs/heads/main\n")
-    assert found() == commit
-    (git / "refs" / "heads" / "main").write_text("1" * 40)
-    assert found() == "1" * 40
-    (git / "HEAD").write_text(f"{commit}\n")
-    assert found() == commit
-    assert checkpoints.FORMAT == 1

@@ -12,7 +12,7 @@ from lsmgeo.data import ShardSet
 from lsmgeo.errors import OptionError
 from lsmgeo.models import create, write_weights
 from lsmgeo.models.training import TrainingConfig, train
-from lsmgeo.models.training.checkpoints import load_checkpoint
+from lsmgeo.models.training.checkpoints import load_latest
 from lsmgeo.models.training.evaluating import Evaluation
 from tests.models.training.runs import SIZES, configure, run, write_shapes
 
@@ -28,7 +28,7 @@ def changed(config: TrainingConfig, group: str, **settings: object) -> TrainingC
 
 def test_a_run_that_ends_by_the_clock_keeps_its_last_measure(shards, tmp_path):
     ended = run(configure(shards, steps=None, minutes=0.03, checkpoint_every=1), tmp_path)
-    checkpoint = load_checkpoint(tmp_path)
+    checkpoint = load_latest(tmp_path)
     assert ended.ended == "minutes"
     assert ended.best == ended.step > 0
     assert (checkpoint.step, checkpoint.best) == (ended.step, ended.step)
@@ -37,7 +37,7 @@ def test_a_run_that_ends_by_the_clock_keeps_its_last_measure(shards, tmp_path):
 
 def test_another_evaluation_forgets_the_best_of_the_one_before(shards, tmp_path):
     run(configure(shards, steps=2, evaluate_every=2), tmp_path)
-    place = load_checkpoint(tmp_path).part("place")
+    place = load_latest(tmp_path).part("place")
     assert place["best"] == 2
     ended = run(configure(shards, steps=3, evaluate_every=100, evaluate_shapes=1), tmp_path)
     # Were the first still held, it could only be beaten, and what beats it was measured on half of the shapes.

@@ -7,15 +7,8 @@ import math
 import pytest
 import torch
 
-from lsmgeo.errors import OptionError, TrainingError
-from lsmgeo.models.training.guard import StepGuard, are_finite
-
-
-def test_are_finite_looks_at_every_number():
-    assert are_finite()
-    assert are_finite(0.0, torch.tensor(3.0), torch.tensor([1e30]))
-    for bad in (math.nan, math.inf, -math.inf, torch.tensor(math.nan), torch.tensor(math.inf, dtype=torch.bfloat16)):
-        assert not are_finite(1.0, bad)
+from lsmgeo.errors import TrainingError
+from lsmgeo.models.training.guard import StepGuard
 
 
 def test_one_bad_gradient_would_poison_adam_for_good():
@@ -44,10 +37,10 @@ def test_three_in_a_row_end_it_and_are_named():
         guard.admits(6, is_bad=True, names=("bed-6",))
 
 
-@pytest.mark.parametrize(("share", "minimum", "ends_at"), [(0.001, 5, 12), (0.25, 0, 2), (1.0, 0, None), (0.0, 0, 2)])
-def test_a_larger_share_of_all_steps_ends_it(share, minimum, ends_at):
-    """Every second step is bad: of 12, the sixth, which is the first above the minimum of 5."""
-    guard = StepGuard(share=share, minimum=minimum)
+@pytest.mark.parametrize(("share", "ends_at"), [(0.001, 12), (0.0, 12), (0.49, 12), (0.5, None), (1.0, None)])
+def test_a_larger_share_of_all_steps_ends_it(share, ends_at):
+    """Every second step is bad: of 12, the sixth, which is the first above the 5 that are forgiven."""
+    guard = StepGuard(share=share)
     ended = None
     for step in range(1, 100):
         try:
@@ -82,9 +75,3 @@ def test_a_resumed_run_goes_on_counting():
         resumed.admits(2, is_bad=True)
     # The state was copied.
     assert guard.state_dict()["steps"] == 1
-
-
-@pytest.mark.parametrize("options", [{"in_a_row": 0}, {"share": -0.1}, {"share": 2.0}, {"minimum": -1}])
-def test_impossible_options_are_refused(options):
-    with pytest.raises(OptionError, match=next(iter(options))):
-        StepGuard(**options)

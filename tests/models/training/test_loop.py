@@ -31,7 +31,7 @@ from lsmgeo.models.training import (
     read_config,
     starting,
 )
-from lsmgeo.models.training.checkpoints import load_checkpoint
+from lsmgeo.models.training.checkpoints import load_latest
 from lsmgeo.models.training.feeding import Need, open_shapes, training_batches, validation_batches
 from tests.models.training import faults
 from tests.models.training.runs import configure, end_of, events, losses, run, write_shapes
@@ -156,7 +156,7 @@ def test_what_a_run_leaves(shards, tmp_path):
     trained = run(config, tmp_path)
     assert (trained.step, trained.ended, trained.exit_code, trained.is_first) == (2, "steps", 0, True)
     assert trained.checkpoint == tmp_path / "checkpoints" / "step_00000002"
-    expected = starting.decided(config, tmp_path / "none")
+    expected = starting.decided(config, None)
     assert read_config(tmp_path / "config.json").to_dict() == expected.to_dict()
     assert [line["event"] for line in events(tmp_path)] == [
         *("start", "checkpoint", "step", "step", "evaluation", "checkpoint", "stop"),
@@ -257,14 +257,14 @@ def test_minutes_count_over_resumes(shards, tmp_path, monkeypatch):
 
     set_clock(itertools.count(1000.0, 60.0).__next__)
     run(configure(shards, steps=1), tmp_path)
-    minutes = load_checkpoint(tmp_path).part("place")["seconds"] / 60
+    minutes = load_latest(tmp_path).part("place")["seconds"] / 60
     assert minutes >= 3
     set_clock(lambda: 5.0)
     trained = run(configure(shards, steps=3, minutes=minutes - 0.5), tmp_path)
     assert (trained.ended, trained.step) == ("minutes", 1)
     trained = run(configure(shards, steps=3, minutes=minutes + 0.5), tmp_path)
     assert (trained.ended, trained.step) == ("steps", 3)
-    assert load_checkpoint(tmp_path).part("place")["seconds"] == pytest.approx(60 * minutes)
+    assert load_latest(tmp_path).part("place")["seconds"] == pytest.approx(60 * minutes)
 
 
 def test_a_run_that_has_ended_has_nothing_to_do(shards, plain):
@@ -314,7 +314,7 @@ def test_two_runs_do_not_share_a_folder(shards, tmp_path):
 def test_what_cannot_be_is_told_before_the_work(shards, tmp_path, changes, message):
     with pytest.raises((OptionError, OSError), match=message):
         run(configure(shards, **changes), tmp_path / "run")
-    assert not (tmp_path / "run" / "checkpoints").exists()
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_folder_that_cannot_be_written_is_told_before_the_work(shards, tmp_path):
@@ -355,21 +355,21 @@ def test_what_is_left_to_the_trainer_is_decided_once(shards, tmp_path, monkeypat
     left = configure(shards, precision="auto")
     for has_amx, expected in ((False, "no"), (True, "bf16")):
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda has_amx=has_amx: {"amx_bf16": has_amx})
-        decided = starting.decided(left, tmp_path / "none")
+        decided = starting.decided(left, None)
         assert (decided.run.precision, decided.run.channels_last) == (expected, False)
     run(configure(shards, steps=1, precision="auto"), tmp_path / "run")
     assert read_config(tmp_path / "run" / "config.json").run.precision == "bf16"
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": False})
     assert run(configure(shards, steps=2, precision="auto"), tmp_path / "run").step == 2
     r2n2 = dataclasses.replace(left, model=ModelConfig(name="r2n2", preset="tiny"))
-    assert starting.decided(r2n2, tmp_path / "none").run.channels_last is True
+    assert starting.decided(r2n2, None).run.channels_last is True
 
 
 def test_weights_say_what_they_reached(shards, tmp_path):
     run(configure(shards, steps=2, evaluate_every=1), tmp_path)
     measured = [line["iou"] for line in events(tmp_path, "evaluation")]
     for step, iou in enumerate(measured, 1):
-        about = load_checkpoint(tmp_path / "checkpoints" / f"step_{step:08d}").weights.about
+        about = load_latest(tmp_path / "checkpoints" / f"step_{step:08d}").weights.about
         assert about["validation"] == {"step": step, "measure": "iou", "by_view": [iou["1"], iou["2"]]}
 
 

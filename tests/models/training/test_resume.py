@@ -6,17 +6,20 @@ import contextlib
 import dataclasses
 import itertools
 import os
+import random
 import shutil
 import time
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
 import pytest
+import torch
 
 from lsmgeo.errors import CheckpointError
 from lsmgeo.models import create
-from lsmgeo.models.training import OptimiserConfig, TrainingConfig, loop, read_config
-from lsmgeo.models.training.checkpoints import load_checkpoint
+from lsmgeo.models.training import OptimiserConfig, TrainingConfig, checkpoints, loop, read_config
+from lsmgeo.models.training.checkpoints import load_latest
 from tests.models.training.runs import SIZES, assert_same_end, configure, events, losses, run, stop_in, write_shapes
 
 
@@ -101,6 +104,35 @@ def test_the_same_seed_gives_the_same_run(shards, whole, tmp_path):
     assert losses(tmp_path) == losses(whole)
 
 
+def test_nothing_is_drawn_from_generators_of_all(shards, whole, begun, monkeypatch):
+    """No state of them is saved: they are set to something else before every step, in a run that stops and goes on.
+
+    Its first checkpoint is of an earlier version, which did save it.
+    """
+    find, save, seeds = loop.find_gradients, loop.save_checkpoint, itertools.count(100)
+
+    def find_gradients(*arguments, **options):
+        seed = next(seeds)
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002 - the generator of all
+        torch.manual_seed(seed)
+        return find(*arguments, **options)
+
+    def save_checkpoint(*arguments, state, **options):
+        state = {**state, "random": {"torch": torch.get_rng_state(), "cuda": [], "python": [3, torch.ones(625), None]}}
+        return save(*arguments, state=state, **options)
+
+    monkeypatch.setattr(loop, "find_gradients", find_gradients)
+    monkeypatch.setattr(loop, "save_checkpoint", save_checkpoint)
+    with monkeypatch.context() as patch:
+        stop_in(patch, 2)
+        assert run(configure(shards), begun).step == 4
+    assert "random" in load_latest(begun).state
+    run(configure(shards), begun)
+    assert_same_end(begun, whole)
+    assert losses(begun) == losses(whole)
+
+
 # Four on a machine of two cores are told to be many, and do as they should.
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 @pytest.mark.parametrize("workers", [1, pytest.param(4, marks=pytest.mark.long)])
@@ -114,6 +146,13 @@ def test_a_run_goes_on_with_other_workers_and_later_checkpoints(shards, whole, b
     run(configure(shards, workers=2, checkpoint_every=3, keep=1), begun)
     assert_same_end(begun, whole)
     assert sorted(os.listdir(begun / "checkpoints"))[0] == "LATEST"
+
+
+def test_a_checkpoint_is_read_once(shards, begun, monkeypatch):
+    read, paths = checkpoints.parse_weights, []
+    monkeypatch.setattr(checkpoints, "parse_weights", lambda content, path: paths.append(path) or read(content, path))
+    run(configure(shards, steps=3), begun)
+    assert [path.parent.name for path in paths] == ["step_00000002"]
 
 
 def test_a_finished_run_stays_as_it_is(shards, whole, tmp_path):
@@ -160,7 +199,7 @@ def test_another_run_is_refused_by_the_name_of_what_differs(shards, begun, group
 
 
 def test_weights_of_another_shape_and_states_without_a_part_are_refused(shards, begun, monkeypatch):
-    checkpoint = load_checkpoint(begun)
+    checkpoint = load_latest(begun)
     state = {name: value for name, value in checkpoint.state.items() if name != "guard"}
     other = dataclasses.replace(checkpoint, state=state)
     monkeypatch.setattr(loop, "load_latest", lambda folder: other)
@@ -250,7 +289,7 @@ def test_a_run_killed_while_it_is_timed_is_timed_on(timed, timed_config, tmp_pat
     with cpu_clock(is_new=step == 3):
         run(timed_config, tmp_path)
     # What was slow again at step 4 to 8 is in the time, not in the plan of step 29.
-    assert (load_checkpoint(tmp_path).step == 32) == (step == 29)
+    assert (load_latest(tmp_path).step == 32) == (step == 29)
     if step == 29:
         assert_same_end(tmp_path, timed)
 
@@ -264,7 +303,7 @@ def test_a_stop_while_a_run_is_planned_leaves_no_plan(timed_config, tmp_path, mo
         stop_in(patch, 30)
         stopped = run(timed_config, tmp_path)
     assert (stopped.step, stopped.ended) == (30, "stop")
-    assert load_checkpoint(tmp_path).config["run"]["steps"] is None
+    assert load_latest(tmp_path).config["run"]["steps"] is None
     assert events(tmp_path, "plan") == []
     with cpu_clock(is_new=False):
         run(timed_config, tmp_path)

@@ -32,7 +32,6 @@ def test_the_first_signal_sets_a_flag_and_the_handler_comes_back():
             ask()
             assert stop
             assert (stop.signal, stop.exit_code) == (signal.SIGTERM, 143)
-            assert stop.is_agreed()
         assert seen == []
         ask()
         assert seen == [signal.SIGTERM]
@@ -68,11 +67,11 @@ def test_the_second_signal_ends_the_process_at_once():
     assert in_child(work) == 143
 
 
-def test_other_signals_can_be_caught():
-    with catch_stop((signal.SIGUSR1, signal.SIGINT)) as stop:
+def test_another_signal_after_the_first_changes_nothing():
+    with catch_stop() as stop:
         ask(signal.SIGINT)
         assert stop.exit_code == 130
-        ask(signal.SIGUSR1)  # another one changes nothing: torchrun answers Ctrl-C with a signal of its own
+        ask(signal.SIGTERM)  # another one changes nothing: torchrun answers Ctrl-C with a signal of its own
         assert stop.exit_code == 130
 
 
@@ -193,7 +192,7 @@ def test_processes_agree(tmp_path):
             if rank == 1:
                 ask()
             assert bool(stop) == (rank == 1)
-            assert stop.is_agreed()
+            assert any_true(bool(stop))
             assert not any_true(stop.signal is not None and rank == 0)
 
     assert in_two_processes(tmp_path, work) == [0, 0]

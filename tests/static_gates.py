@@ -36,8 +36,8 @@ GATES = [
 # Where a construct is at home.
 AT_HOME = {
     r"\bgrid_sample\s*\(": ("lsmgeo/kernels/",),
-    # The script of a guarded process, which it may crash.
-    r"\bloadmat\s*\(": ("lsmgeo/data/mat_worker.py",),
+    # Runs in an isolated process, which it may crash.
+    r"\bloadmat\s*\(": ("lsmgeo/data/mat_files.py",),
 }
 
 

@@ -11,18 +11,25 @@ import numpy as np
 
 from lsmgeo.data.assembling import MAX_SIDE, check_intrinsics, check_rotation
 from lsmgeo.data.files import child, refuse_unreadable
+from lsmgeo.data.isolated import isolated
 from lsmgeo.data.lenses import Lens
-from lsmgeo.data.storage import Entries, is_storage, read_storages
+from lsmgeo.data.storage import is_storage, parse_storage
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
 __all__ = ["Board", "CalibratedLens", "Calibration", "Rig", "calibration_files", "is_calibration", "read_calibration"]
 
 Value = TypeVar("Value")
 
 MOST_FILES = 64
+# A calibration with the corners of a hundred boards in it has one tenth of this.
+MAX_STORAGE_BYTES = 1 << 22
+# Of address space; OpenCV and NumPy take most of it.
+MEMORY = 1 << 30
+SECONDS = 30.0
+BEYOND = 1e12
 MOST_COEFFICIENT = 1e6
 MOST_CORNERS = 100
 COUNTS = {"perspective": (4, 5, 8, 12, 14), "fisheye": (4,)}
@@ -56,6 +63,14 @@ class CalibratedLens:
     def sized(self, height: int, width: int) -> Lens:
         """The lens for pictures of this size."""
         return Lens(self.kind, self.intrinsics, self.coefficients, height, width)
+
+
+class Entries(NamedTuple):
+    """What one file states, by name."""
+
+    numbers: dict[str, float]
+    texts: dict[str, tuple[str, ...]]
+    matrices: dict[str, np.ndarray]
 
 
 class Rig(NamedTuple):
@@ -167,6 +182,32 @@ def read_calibration(path: str | Path) -> Calibration:
     if not lenses and rig is None and not pictures:
         raise DataError(path, "states no camera matrix, no R and T, and lists no picture")
     return Calibration(lenses, rig, board, pictures)
+
+
+def read_storages(paths: Sequence[Path]) -> list[Entries | DataError]:
+    """Read numbers, texts, lists of texts and matrices from the top of FileStorage files.
+
+    Returns:
+        For each file what it states, or the error of one that cannot be used. Matrices are float64.
+    """
+    results: list[Entries | DataError] = []
+    found = isolated(parse_storage, paths, limit=MAX_STORAGE_BYTES, memory=MEMORY, seconds=SECONDS)
+    for path, arrays in zip(paths, found, strict=True):
+        if isinstance(arrays, DataError):
+            results.append(arrays)
+            continue
+        numbers = {name: array for name, array in arrays.items() if array.dtype == np.float64 and array.ndim in (0, 2)}
+        wrong = [name for name, array in numbers.items() if not (np.abs(array) <= BEYOND).all()]
+        if wrong:
+            reason = f"{wrong[0][:80]!r} must hold finite numbers of at most {BEYOND:g}"
+            results.append(DataError(path, reason))
+            continue
+        results.append(Entries(
+            {name: float(array) for name, array in numbers.items() if array.ndim == 0},
+            {name: tuple(array.ravel().tolist()) for name, array in arrays.items() if array.dtype.kind == "U"},
+            {name: array for name, array in numbers.items() if array.ndim == 2},
+        ))  # fmt: skip
+    return results
 
 
 def _folded(entries: Entries, file: Path) -> Entries:

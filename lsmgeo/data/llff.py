@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ import torch
 from lsmgeo.cameras import from_opencv
 from lsmgeo.data.assembling import MAX_PARAMETER, MAX_SIDE, as_data_error, assemble, check_rotation
 from lsmgeo.data.files import child, has_alpha, image_size, refuse_unreadable
-from lsmgeo.data.npy import read_npy
 from lsmgeo.data.posed import PosedImages
 from lsmgeo.errors import DataError
 
@@ -32,7 +32,7 @@ def is_llff(path: Path) -> bool:
     if path.suffix != ".npy":
         return False
     try:
-        return read_npy(path, MAX_BYTES).shape[1:] == (COLUMNS,)
+        return _read_array(path).shape[1:] == (COLUMNS,)
     except DataError:
         return False
 
@@ -63,7 +63,7 @@ def read_llff(path: str | Path) -> PosedImages:
     """
     path = Path(path)
     file = path / NAME if path.is_dir() else path
-    rows = read_npy(file, MAX_BYTES)
+    rows = _read_array(file)
     if rows.ndim != 2 or rows.shape[1] != COLUMNS or len(rows) == 0:
         raise DataError(file, f"must hold rows of {COLUMNS} numbers; got an array of {rows.shape}")
     if not (np.abs(rows) < 1e12).all():
@@ -98,6 +98,24 @@ def read_llff(path: str | Path) -> PosedImages:
         )
     names = [picture.name for picture in paths]
     return assemble(names, paths, cameras, "llff", file=file, cut_out=any(map(has_alpha, paths)))
+
+
+def _read_array(file: Path) -> np.ndarray:
+    """float64 of the shape that the file states, which is compared with its size before anything is allocated."""
+    if not file.is_file() or (size := file.stat().st_size) > MAX_BYTES:
+        raise DataError(file, f"no such file, or larger than the limit of {MAX_BYTES} bytes")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            array = np.lib.format.open_memmap(file, mode="r")
+    # NumPy evaluates the header as a literal, which raises nearly everything.
+    except Exception as error:
+        raise DataError(file, f"is not a .npy array ({str(error)[:120]})") from error
+    if array.dtype.newbyteorder("=") not in (np.float32, np.float64):
+        raise DataError(file, f"must hold float32 or float64; got {str(array.dtype)[:80]}")
+    if array.offset + array.nbytes != size:
+        raise DataError(file, f"states an array of {array.shape}, and holds more")
+    return np.array(array, np.float64)
 
 
 def _pictures(file: Path) -> list[Path]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,24 +15,30 @@ from lsmgeo.cameras import from_opencv
 from lsmgeo.data.assembling import as_data_error, check_intrinsics, check_rotation
 from lsmgeo.data.depth_files import DepthPng
 from lsmgeo.data.files import child, image_size, refuse_unreadable
-from lsmgeo.data.mat_files import read_mats
+from lsmgeo.data.isolated import isolated
+from lsmgeo.data.mat_files import parse_mat
 from lsmgeo.data.metadata import MAX_VIEWS
 from lsmgeo.data.posed import PosedImages, Voxels
-from lsmgeo.errors import DataError
+from lsmgeo.errors import DataError, OptionError
 from lsmgeo.grids import VoxelGrid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from lsmgeo.data.mat_files import Arrays
-
-__all__ = ["LsmObject", "find_lsm", "is_lsm", "read_lsm", "read_lsm_objects", "spell_synset"]
+__all__ = ["LsmObject", "find_lsm", "is_lsm", "read_lsm", "read_lsm_objects", "read_mats", "spell_synset"]
 
 RENDER = re.compile(r"render_(0|[1-9][0-9]{0,4})\.png")
 RESOLUTIONS = (32, 64)
 # A step of depth in world units; the largest value means that nothing is there.
 DEPTH_STEP = 10 / 65535
 NO_DEPTH = 65535
+# 128^3 bytes uncompressed fit.
+MAX_MAT_BYTES = 1 << 22
+# Of address space; the libraries take 200 MiB of it.
+MEMORY = 1 << 29
+SECONDS = 60.0
+
+Arrays = dict[str, np.ndarray]
 
 
 class LsmObject(NamedTuple):
@@ -133,6 +140,26 @@ def read_lsm_objects(objects: Sequence[LsmObject]) -> list[tuple[PosedImages, tu
             results.append((_scene(found, [_arrays(mats[file]) for file in found.cameras]), grids))
         except DataError as error:
             results.append(error)
+    return results
+
+
+def read_mats(paths: Sequence[Path]) -> list[Arrays | DataError]:
+    """Read K, extrinsic and Volume from MATLAB files up to version 7.2, as far as each holds them.
+
+    Returns:
+        For each file its arrays, float64 or, beyond 64 elements, bool; or the error of one that cannot be used.
+
+    Raises:
+        OptionError: SciPy is missing.
+    """
+    if find_spec("scipy") is None:
+        raise OptionError("read_mats: MATLAB files need SciPy; install lsmgeo[data]")
+    results = isolated(parse_mat, paths, limit=MAX_MAT_BYTES, memory=MEMORY, seconds=SECONDS)
+    for number, (path, found) in enumerate(zip(paths, results, strict=True)):
+        if isinstance(found, dict):
+            for name, array in found.items():
+                if array.dtype not in (np.float64, np.bool_) or not np.isfinite(array).all():
+                    results[number] = DataError(path, f"{name} must hold finite numbers")
     return results
 
 

@@ -1,42 +1,26 @@
-"""Files of OpenCV's FileStorage (YAML, XML, JSON) as plain names and values, parsed where a crash does no harm."""
+"""Reads files of OpenCV's FileStorage (YAML, XML, JSON) for `calibration`; imports nothing of this package.
+
+`parse_storage` runs in an isolated process, which the file may crash.
+"""
 
 from __future__ import annotations
 
-import json
 import re
-import struct
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lsmgeo.data.files import read_text
-from lsmgeo.data.guarded import run_guarded
-from lsmgeo.errors import DataError
-
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from pathlib import Path
 
-__all__ = ["Entries", "is_storage", "read_storages"]
+__all__ = ["is_storage", "parse_storage"]
 
-WORKER = Path(__file__).with_name("storage_worker.py")
-# A calibration with the corners of a hundred boards in it has one tenth of this.
-MAX_STORAGE_BYTES = 1 << 22
-# Of address space; OpenCV and NumPy take most of it.
-MEMORY = 1 << 30
-SECONDS = 30.0
 SUFFIXES = (".yml", ".yaml", ".xml", ".json")
 MATRIX = re.compile(rb"opencv-(nd-)?matrix")
 PICTURE = re.compile(rb"\.(png|jpe?g)\b", re.IGNORECASE)
-BEYOND = 1e12
-
-
-class Entries(NamedTuple):
-    """What one file states, by name."""
-
-    numbers: dict[str, float]
-    texts: dict[str, tuple[str, ...]]
-    matrices: dict[str, np.ndarray]
+MOST_ENTRIES = 1000
+MOST_VALUES = 20_000
+MOST_TEXT = 512
 
 
 def is_storage(path: Path) -> bool:
@@ -52,80 +36,62 @@ def is_storage(path: Path) -> bool:
     return start.startswith(b"%YAML") and (MATRIX.search(start) or PICTURE.search(start)) is not None
 
 
-def read_storages(paths: Sequence[Path]) -> list[Entries | DataError]:
-    """Read numbers, texts, lists of texts and matrices from the top of FileStorage files.
+def parse_storage(content: bytes) -> dict[str, np.ndarray]:
+    """What stands at the top of a file: numbers (), texts (), lists of texts (N,), matrices (rows, columns).
 
-    All files go to one process, as starting it takes a third of a second; where it dies, each gets one of its own.
-    Each is handed over as text, so that the parser opens no file, neither this nor another or a compressed one.
-
-    Returns:
-        For each file what it states, or the error of one that cannot be used. Matrices are float64.
+    Numbers are float64, NaN what is none in a matrix. Everything else is left out.
     """
-    results: dict[int, Entries | DataError] = {}
-    contents: dict[int, bytes] = {}
-    for index, path in enumerate(paths):
-        try:
-            contents[index] = read_text(path, MAX_STORAGE_BYTES).encode()
-        except DataError as error:
-            results[index] = error
-    groups = [list(contents)] if contents else []
-    while groups:
-        group = groups.pop()
-        try:
-            lines = _ask([contents[index] for index in group], paths[group[0]])
-        except DataError as error:
-            if len(group) == 1:
-                results[group[0]] = error
-            else:
-                middle = len(group) // 2
-                groups += [group[:middle], group[middle:]]
-            continue
-        results |= {index: _taken(line, paths[index]) for index, line in zip(group, lines, strict=True)}
-    return [results[index] for index in range(len(paths))]
+    import cv2
 
-
-def _ask(contents: Sequence[bytes], path: Path) -> list[bytes]:
-    packed = b"".join(struct.pack("<I", len(content)) + content for content in contents)
-    lines = run_guarded(WORKER, packed, memory=MEMORY, seconds=SECONDS, path=path).split(b"\n")
-    if len(lines) != len(contents) + 1:
-        raise DataError(path, "made its parser answer nonsense")
-    return lines[:-1]
-
-
-def _taken(line: bytes, path: Path) -> Entries | DataError:
-    """What the worker says of one file; it is believed no more than the file."""
     try:
-        answer = json.loads(line)
-        if "error" in answer:
-            reason = "".join(c if c.isprintable() else "?" for c in str(answer["error"])[:200])
-            return DataError(path, f"is no file of OpenCV's FileStorage ({reason})")
-        entries = Entries({}, {}, {})
-        for name, value in answer["entries"]:
-            if not isinstance(name, str):
-                raise ValueError("a name that is no text")
-            _sort(entries, name, value, path)
-    except DataError as error:
-        return error
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-        return DataError(path, f"made its parser answer nonsense ({error})")
-    return entries
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError("is not a text file (invalid UTF-8)") from error
+    if "\0" in text:
+        raise ValueError("is not a text file (it holds a zero byte)")
+    try:
+        # As text, so that the parser opens no file, neither this nor another or a compressed one.
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        root = storage.root()
+        names = root.keys() if root.isMap() else []
+        if not 0 < len(names) <= MOST_ENTRIES or len(set(names)) != len(names):
+            raise ValueError("it holds no names, too many, or one twice")
+        values = {name: _value(root.getNode(name)) for name in names}
+    except MemoryError:
+        raise
+    # OpenCV's binding raises SystemError for what it cannot parse, and cv2.error for the rest.
+    except Exception as error:
+        raise ValueError(f"is no file of OpenCV's FileStorage ({str(error.__cause__ or error)[:200]})") from error
+    return {name: value for name, value in values.items() if value is not None}
 
 
-def _sort(entries: Entries, name: str, value: Any, path: Path) -> None:
-    if isinstance(value, dict):
-        rows, columns, values = value["rows"], value["columns"], value["values"]
-        # Of several channels, as corners in pictures have, nothing is used.
-        if type(rows) is int and type(columns) is int and rows > 0 and columns > 0 and len(values) == rows * columns:
-            entries.matrices[name] = np.array([_finite(x, name, path) for x in values]).reshape(rows, columns)
-    elif isinstance(value, str):
-        entries.texts[name] = (value,)
-    elif isinstance(value, list):
-        entries.texts[name] = tuple(str(text) for text in value)
-    else:
-        entries.numbers[name] = _finite(value, name, path)
+def _value(node: Any) -> np.ndarray | None:
+    if node.isMap():
+        return _matrix(node)
+    if node.isSeq():
+        items = [node.at(index) for index in range(min(node.size(), MOST_ENTRIES + 1))]
+        if len(items) > MOST_ENTRIES or not all(item.isString() for item in items):
+            return None
+        return np.array([item.string()[: MOST_TEXT + 1] for item in items], np.str_)
+    if node.isString():
+        return np.array(node.string()) if len(node.string()) <= MOST_TEXT else None
+    return np.array(_number(node)) if node.isInt() or node.isReal() else None
 
 
-def _finite(value: Any, name: str, path: Path) -> float:
-    if type(value) not in (int, float) or not -BEYOND <= value <= BEYOND:
-        raise DataError(path, f"{name} must hold finite numbers of at most {BEYOND:g}")
-    return float(value)
+def _matrix(node: Any) -> np.ndarray | None:
+    data, sizes = node.getNode("data"), node.getNode("sizes")
+    rows, columns = (_number(node.getNode(name)) for name in ("rows", "cols"))
+    if sizes.isSeq() and sizes.size() in (1, 2):
+        # OpenCV 5 writes vectors so.
+        rows, columns = _number(sizes.at(0)), _number(sizes.at(1)) if sizes.size() == 2 else 1.0
+    elif sizes.isInt():  # the same as XML
+        rows, columns = _number(sizes), 1.0
+    # Of several channels, as corners in pictures have, nothing is used.
+    if not data.isSeq() or data.size() > MOST_VALUES or rows <= 0 or rows * columns != data.size():
+        return None
+    # The numbers as they stand, not `node.mat()`: that one allocates what rows and columns ask for.
+    return np.array([_number(data.at(index)) for index in range(data.size())]).reshape(int(rows), int(columns))
+
+
+def _number(node: Any) -> float:
+    return float(node.real()) if node.isInt() or node.isReal() else np.nan

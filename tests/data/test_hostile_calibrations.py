@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from lsmgeo import data
-from lsmgeo.data import calibration, storage
-from lsmgeo.data.storage import read_storages
+from lsmgeo.data import calibration
+from lsmgeo.data.calibration import read_storages
 from lsmgeo.errors import DataError
 from tests.data.hostile import judged, mutated
 from tests.data.test_calibration import YAML, write_rig, write_storage
@@ -125,47 +125,17 @@ def test_compressed_files_pipes_and_links_are_not_followed(tmp_path):
         data.read_calibration(folder)
 
 
-def test_a_file_that_kills_its_parser_harms_no_other(tmp_path, monkeypatch):
-    worker = tmp_path / "worker.py"
-    worker.write_text(
-        "import os, struct, sys\n"
-        "while header := sys.stdin.buffer.read(4):\n"
-        "    content = sys.stdin.buffer.read(*struct.unpack('<I', header))\n"
-        "    if b'bad' in content:\n"
-        "        os.abort()\n"
-        '    print(\'{"entries": [["a", 1.5]]}\', flush=True)\n'
-    )
-    monkeypatch.setattr(storage, "WORKER", worker)
-    paths = []
-    for index, content in enumerate(("good", "bad", "good")):
-        paths.append(tmp_path / f"{index}.yml")
-        paths[-1].write_text(content)
-    first, second, third = read_storages(paths)
-    assert first.numbers == third.numbers == {"a": 1.5}
-    assert str(second) == f"{paths[1]}: crashed its parser (SIGABRT)"
-
-
-@pytest.mark.parametrize(
-    "answer",
-    [b"", b"[]", b"{}", b'{"entries": 1}', b'{"entries": [[1, 2]]}', b'{"entries": [["a", {"rows": 1}]]}',
-     b'{"entries": [["a", {"rows": 2, "columns": 1, "values": ["x", null]}]]}', b'{"entries": [["a", 1e999]]}',
-     b'{"entries": [["a", NaN]]}', b'{"entries": [["a", true]]}', b'{"entries": [["a"]]}', b"[" * 99_999,
-     b'{"error": "\\u001b[31m"}'],
-)  # fmt: skip
-def test_a_parser_that_was_taken_over_is_not_believed(tmp_path, monkeypatch, answer):
-    worker = tmp_path / "worker.py"
-    worker.write_text(f"import sys\nsys.stdin.buffer.read()\nsys.stdout.buffer.write({answer!r} + b'\\n')\n")
-    monkeypatch.setattr(storage, "WORKER", worker)
-    (tmp_path / "a.yml").write_text(YAML)
-    (result,) = read_storages([tmp_path / "a.yml"])
-    assert isinstance(result, DataError)
-    assert result.path == tmp_path / "a.yml"
-    assert str(result).isprintable()
+@pytest.mark.parametrize("array", [np.array(np.nan), np.array(1e13), np.array([[np.inf]])])
+def test_the_answer_of_a_process_is_checked(tmp_path, monkeypatch, array):
+    monkeypatch.setattr(calibration, "isolated", lambda *_, **__: [{"a": array}])
+    (found,) = read_storages([tmp_path / "a.yml"])
+    assert isinstance(found, DataError)
+    assert found.path == tmp_path / "a.yml"
 
 
 @pytest.mark.parametrize("ending", ["yml", "xml", "json"])
 def test_damaged_calibrations_give_a_data_error_or_a_calibration(tmp_path, monkeypatch, ending):
-    trials = 2000 if ending == "yml" else 700
+    trials = 300
     rng = np.random.default_rng(0)
     source = tmp_path / f"source.{ending}"
     write_storage(source, camera_matrix=np.eye(3), D=np.full(5, 0.25), R=np.eye(3), T=np.ones(3), image_width=64,

@@ -1,0 +1,183 @@
+"""Parsers that a damaged file can crash, run where that does no harm: in a process of their own."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import io
+import json
+import os
+import runpy
+import signal
+import subprocess
+import sys
+import tempfile
+from typing import TYPE_CHECKING, BinaryIO
+
+import numpy as np
+
+# Nothing of this package: the file is also the script of the process, and importing the package takes seconds.
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from lsmgeo.errors import DataError
+
+__all__ = ["isolated"]
+
+Arrays = dict[str, np.ndarray]
+
+MOST_ANSWERED = 1 << 28
+MOST_NAMES = 1 << 20
+
+
+def isolated(
+    function: Callable[..., Mapping[str, np.ndarray]],
+    paths: Sequence[Path],
+    *arguments: object,
+    limit: int,
+    memory: int,
+    seconds: float,
+) -> list[Arrays | DataError]:
+    """Call ``function(content, *arguments)`` for files that may crash it, in another process, and return its arrays.
+
+    All files go to one process, since starting it takes longer than reading hundreds; when a file ends it, the rest
+    goes to another. The process is an isolated interpreter (``python -I``) that runs the function's source file alone.
+    It has limited memory and time, and leaves no core dump; systems without POSIX limits keep a limit of time. Its
+    answers are checked like a file, as hostile bytes may have taken it over: they hold plain arrays, no pickle.
+
+    Args:
+        function: at the top of a file that imports nothing of this package, and little else, as each start imports it.
+            Whatever it raises refuses the file, and is the reason.
+        paths: the files.
+        arguments: what JSON can hold.
+        limit: most bytes of a file.
+        memory: address space in bytes, libraries included.
+        seconds: what a file may take. All together may take that and one second each.
+
+    Returns:
+        For each file the arrays (bool, numbers or text), or why it cannot be used.
+    """
+    from lsmgeo.data.files import read_bytes
+    from lsmgeo.errors import DataError
+
+    answers: dict[int, Arrays | DataError] = {}
+    files = []
+    for number, path in enumerate(paths):
+        try:
+            files.append((number, path, read_bytes(path, limit)))
+        except DataError as error:
+            answers[number] = error
+    while files:
+        found = _ask(function, [file[1:] for file in files], arguments, memory, seconds)
+        answers |= {file[0]: answer for file, answer in zip(files, found, strict=False)}
+        files = files[len(found) :]
+    return [answers[number] for number in range(len(paths))]
+
+
+def _ask(
+    function: Callable[..., object], files: Sequence[tuple[Path, bytes]], arguments: object, memory: int, seconds: float
+) -> list[Arrays | DataError]:
+    """The answers up to the first file that ends the process, at least one."""
+    from lsmgeo.errors import DataError
+
+    order = json.dumps([memory, seconds, inspect.getsourcefile(function), function.__name__, arguments])
+    content = b"".join(len(content).to_bytes(8, "little") + content for _, content in files)
+    # Threads of linear algebra reserve address space for nothing.
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    with tempfile.TemporaryFile() as output:
+        try:
+            code = subprocess.run(
+                [sys.executable, "-I", "-B", __file__, order],
+                input=content,
+                stdout=output,
+                stderr=subprocess.DEVNULL,
+                env=environment,
+                timeout=seconds + len(files),
+                check=False,
+            ).returncode
+            reason = _reason(code, seconds)
+        except subprocess.TimeoutExpired:
+            reason = f"took its parser more than {seconds:g} seconds"
+        except OSError as error:
+            return [
+                DataError(path, f"cannot be read: no process could be started for it ({error})") for path, _ in files
+            ]
+        output.seek(0)
+        answers: list[Arrays | DataError] = []
+        for path, _ in files:
+            try:
+                found = _received(output, reason)
+            # The process is believed no more than the file, and NumPy raises nearly everything on damaged arrays.
+            except Exception:
+                return [*answers, DataError(path, "made its parser answer nonsense")]
+            if isinstance(found, str):
+                answers.append(DataError(path, "".join(c if c.isprintable() else "?" for c in found[:300])))
+                if found == reason:
+                    break
+            else:
+                answers.append(found)
+    return answers
+
+
+def _received(stream: BinaryIO, reason: str) -> Arrays | str:
+    """The next answer: arrays, or why there are none, which is ``reason`` where the process ended."""
+    line = stream.readline(MOST_NAMES)
+    if not line.endswith(b"\n"):
+        return reason
+    answer = json.loads(line)
+    if isinstance(answer, str):
+        return answer
+    arrays = {}
+    for name in answer["names"]:
+        arrays[name] = array = np.lib.format.read_array(stream, allow_pickle=False)
+        if not isinstance(name, str) or array.dtype.kind not in "biufU":
+            raise ValueError("no plain array")
+    return arrays
+
+
+def _reason(code: int, seconds: float) -> str:
+    if code >= 0:
+        return "made its parser fail" if code else "made its parser answer nonsense"
+    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+    return f"took its parser more than {seconds:g} seconds" if name == "SIGALRM" else f"crashed its parser ({name})"
+
+
+def _serve(memory: int, seconds: float, source: str, name: str, arguments: list[object]) -> None:
+    """In the process: answer for every file on standard input."""
+    with contextlib.suppress(ImportError):
+        import resource
+
+        for limit, most in (("AS", memory), ("FSIZE", MOST_ANSWERED), ("CORE", 0)):
+            kind = getattr(resource, f"RLIMIT_{limit}")
+            hard = resource.getrlimit(kind)[1]
+            most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+            with contextlib.suppress(ValueError, OSError):
+                resource.setrlimit(kind, (most, most))
+    output, sys.stdout = sys.stdout.buffer, sys.stderr  # what a library prints is no answer
+    function = runpy.run_path(source)[name]
+    alarm = getattr(signal, "setitimer", None)
+    while header := sys.stdin.buffer.read(8):
+        content = sys.stdin.buffer.read(int.from_bytes(header, "little"))
+        if alarm is not None:  # of which the process dies
+            alarm(signal.ITIMER_REAL, seconds)
+        answer = io.BytesIO()
+        try:
+            arrays = function(content, *arguments)
+            answer.write(json.dumps({"names": list(arrays)}).encode() + b"\n")
+            for array in arrays.values():
+                np.lib.format.write_array(answer, np.asarray(array), allow_pickle=False)
+        except ImportError:
+            raise
+        except MemoryError:
+            answer = io.BytesIO(json.dumps(f"needs more than {memory} bytes of memory to be read").encode() + b"\n")
+        except Exception as error:
+            answer = io.BytesIO(json.dumps(str(error)[:300] or type(error).__name__).encode() + b"\n")
+        if alarm is not None:
+            alarm(signal.ITIMER_REAL, 0)
+        output.write(answer.getbuffer())
+        output.flush()
+
+
+if __name__ == "__main__":
+    _serve(*json.loads(sys.argv[1]))

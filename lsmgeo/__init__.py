@@ -1,10 +1,13 @@
 """Features between images and 3D space: differentiable unprojection and plane-sweep projection on kornia cameras."""
 
-from lsmgeo import cameras, errors, functional, fusion, kernels, rays
-from lsmgeo.cameras import CameraTensors
-from lsmgeo.debugging import debug
-from lsmgeo.grids import FrustumGrid, VoxelGrid, depth_planes
-from lsmgeo.layers import PlaneSweepProject, Unproject
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lsmgeo import cameras, errors, functional, fusion, kernels, rays
+    from lsmgeo.cameras import CameraTensors
+    from lsmgeo.debugging import debug
+    from lsmgeo.grids import FrustumGrid, VoxelGrid, depth_planes
+    from lsmgeo.layers import PlaneSweepProject, Unproject
 
 __version__ = "0.1.0"
 
@@ -24,3 +27,29 @@ __all__ = [
     "kernels",
     "rays",
 ]
+
+# Where the names of `__all__` that are no modules live.
+_HOMES = {
+    "CameraTensors": "cameras",
+    "FrustumGrid": "grids",
+    "PlaneSweepProject": "layers",
+    "Unproject": "layers",
+    "VoxelGrid": "grids",
+    "debug": "debugging",
+    "depth_planes": "grids",
+}
+
+# Imported with their first use (PEP 562): without PyTorch, `lsmgeo --help` answers at once.
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> object:
+        from importlib import import_module
+
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module = import_module(f"{__name__}.{_HOMES.get(name, name)}")
+        value = globals()[name] = getattr(module, name) if name in _HOMES else module
+        return value
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__all__})

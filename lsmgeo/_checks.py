@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import zip_longest
 from math import prod
 from numbers import Integral, Real
 from typing import Any
@@ -115,11 +116,14 @@ def check_flag(who: str, name: str, value: Any) -> bool:
 
 def check_broadcast(who: str, **shapes: Sequence[int]) -> tuple[int, ...]:
     """Require leading shapes that broadcast, and return the one that comes of it."""
-    try:
-        return tuple(torch.broadcast_shapes(*(tuple(shape) for shape in shapes.values())))
-    except RuntimeError:
-        came = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
-        raise ShapeError(f"{who}: leading shapes must broadcast; got {came}") from None
+    common: list[int] = []
+    for sizes in zip_longest(*(reversed(shape) for shape in shapes.values()), fillvalue=1):
+        others = [size for size in sizes if size != 1]
+        if any(size != others[0] for size in others):
+            came = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
+            raise ShapeError(f"{who}: leading shapes must broadcast; got {came}")
+        common.append(others[0] if others else 1)
+    return tuple(reversed(common))
 
 
 def check_number(who: str, name: str, value: Any, expected: str) -> float:
@@ -148,7 +152,7 @@ def check_size(who: str, name: str, value: Any, length: int, expected: str) -> t
         not isinstance(value, Sequence)
         or isinstance(value, str)
         or len(value) != length
-        or not all(isinstance(item, int | torch.SymInt) and not isinstance(item, bool) for item in value)
+        or not all(isinstance(item, (int, torch.SymInt)) and not isinstance(item, bool) for item in value)
     ):
         raise ShapeError(f"{who}: {name} must be {expected}; got {describe(value)}")
     if any(item < 1 for item in value):

@@ -68,7 +68,7 @@ def image_matrices(who: str, features: Tensor, cameras: Cameras, view_mask: Tens
 
 
 def _lattice(who: str, grid: Grid, source: Tensor) -> Lattice:
-    if not isinstance(grid, VoxelGrid | FrustumGrid):
+    if not isinstance(grid, (VoxelGrid, FrustumGrid)):
         raise DTypeError(f"{who}: grid must be a VoxelGrid or a FrustumGrid; got {describe(grid)}")
     if not isinstance(source, Tensor):
         return grid.lattice()

@@ -5,13 +5,10 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from inspect import signature
-from typing import TYPE_CHECKING, Any, Literal
-
-if TYPE_CHECKING:
-    from contextlib import ExitStack
-
-    from lsmgeo.data import Made
+from pathlib import Path
+from typing import Any, Literal
 
 __all__ = ["convert", "demo", "info", "main", "render"]
 
@@ -27,8 +24,6 @@ def demo(out: str = "lsmgeo-demo") -> None:
     Args:
         out: folder for the picture; created where it does not exist.
     """
-    from pathlib import Path
-
     from lsmgeo.demo import run_demo, write_picture
 
     result = run_demo()
@@ -54,7 +49,6 @@ def info(path: str, out: str = "lsmgeo-info") -> int:
         The exit status: 0 all is well, 1 it is not, 3 nothing could be measured (2 is for what cannot be read).
     """
     import time
-    from pathlib import Path
 
     from lsmgeo import data
     from lsmgeo.data.detect import detect
@@ -119,7 +113,6 @@ def render(
         on_error: what to do with a mesh that cannot be used.
         overwrite: whether to make shards again that were made with other settings.
     """
-    import contextlib
     import time
 
     from lsmgeo.data import Recipe, render_set
@@ -129,7 +122,7 @@ def render(
         raise OptionError(f"render: voxels must be whole numbers with commas between, such as 32,64; got {voxels!r}")
     sides = tuple(int(side[:6]) for side in voxels.split(","))
     start = time.perf_counter()
-    with contextlib.ExitStack() as stack:
+    with ExitStack() as stack:
         if cluster is not None:
             _join(cluster, stack)
         made = render_set(
@@ -145,11 +138,11 @@ def render(
         )
     seconds = time.perf_counter() - start
     print(f"shapes:   {made.shapes}, {views} views each at {size} x {size}")
-    _print_shards(made, out)
+    _print_shards(made.shards, made.kept, out)
     if made.kept < len(made.shards):
         fresh = "" if made.kept else f", {made.shapes * views / seconds:.0f} views a second"
         print(f"time:     {seconds:.1f} s{fresh}")
-    _print_skipped(made, "meshes")
+    _print_skipped(made.skipped, "meshes")
 
 
 def _jobs(jobs: int) -> int:
@@ -162,20 +155,19 @@ def _jobs(jobs: int) -> int:
     return jobs
 
 
-def _print_shards(made: Made, out: str) -> None:
-    from pathlib import Path
+# Types of lsmgeo.data are not named here: the parser of the arguments imports what annotations name.
+def _print_shards(shards: Sequence[Path], kept: int, out: str) -> None:
+    megabytes = sum(path.stat().st_size for path in shards) / 1e6
+    print(f"shards:   {len(shards)} in {Path(out).resolve()}, {megabytes:.0f} MB; {kept} were there already")
 
-    megabytes = sum(path.stat().st_size for path in made.shards) / 1e6
-    print(f"shards:   {len(made.shards)} in {Path(out).resolve()}, {megabytes:.0f} MB; {made.kept} were there already")
 
-
-def _print_skipped(made: Made, what: str) -> None:
-    if made.skipped:
-        print(f"skipped:  {len(made.skipped)} {what} that cannot be used")
-        for path, reason in made.skipped[:MOST_SKIPPED]:
+def _print_skipped(skipped: Sequence[tuple[str, str]], what: str) -> None:
+    if skipped:
+        print(f"skipped:  {len(skipped)} {what} that cannot be used")
+        for path, reason in skipped[:MOST_SKIPPED]:
             print(f"          {path}: {reason}")
-        if len(made.skipped) > MOST_SKIPPED:
-            print(f"          and {len(made.skipped) - MOST_SKIPPED} more")
+        if len(skipped) > MOST_SKIPPED:
+            print(f"          and {len(skipped) - MOST_SKIPPED} more")
 
 
 def _join(address: str, stack: ExitStack) -> None:
@@ -219,8 +211,8 @@ def convert(
     if to == "shards":
         made = data.convert_set(scene, out, splits=splits, jobs=_jobs(jobs), progress=True)
         print(f"objects:  {made.shapes}")
-        _print_shards(made, out)
-        _print_skipped(made, "objects")
+        _print_shards(made.shards, made.kept, out)
+        _print_skipped(made.skipped, "objects")
         return
     if splits is not None or jobs != -1:
         raise OptionError(f"convert: splits and jobs are for shards; got to={to!r}")
@@ -277,7 +269,7 @@ def _run(arguments: Sequence[str] | None) -> int:
 
     from jsonargparse import ActionYesNo, ArgumentParser, auto_cli
 
-    from lsmgeo.models.commands import evaluate, reconstruct, train
+    from lsmgeo.commands import evaluate, reconstruct, train
 
     try:
         release = version("lsmgeo")

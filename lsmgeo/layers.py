@@ -59,7 +59,7 @@ class Unproject(nn.Module):
         backend: str = "auto",
     ) -> None:
         super().__init__()
-        if grid is not None and not isinstance(grid, VoxelGrid | FrustumGrid):
+        if grid is not None and not isinstance(grid, (VoxelGrid, FrustumGrid)):
             raise DTypeError(f"Unproject: grid must be a VoxelGrid or a FrustumGrid; got {describe(grid)}")
         kernels.check_backend("Unproject", backend)
         Options.checked(

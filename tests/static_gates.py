@@ -32,6 +32,8 @@ GATES = [
         "{cameras,kernels}/**/*.py",
         "loses pixels under autocast and TF32",
     ),
+    (r"\b(isinstance|issubclass)\s*\(.*,\s*[\w.]+\s*\|", "**/*.py", "not compiled before PyTorch 2.15: use a tuple"),
+    (r"\btorch\.broadcast_shapes\b", "**/*.py", "imports sympy: use lsmgeo._checks.check_broadcast"),
 ]
 # Where a construct is at home.
 AT_HOME = {

@@ -214,7 +214,7 @@ def stack(cameras: Sequence[Cameras], dim: int = 0) -> CameraTensors:
         >>> tuple(stack(views).intrinsics.shape)
         (3, 3, 3)
     """
-    if not isinstance(cameras, list | tuple) or isinstance(cameras, CameraTensors) or not cameras:
+    if not isinstance(cameras, (list, tuple)) or isinstance(cameras, CameraTensors) or not cameras:
         raise DTypeError(f"stack: cameras must be a list or tuple with at least one camera; got {describe(cameras)}")
     parts = [as_tensors(camera, "stack") for camera in cameras]
     leading = [tuple(part.cam_from_world.shape[:-2]) for part in parts]
@@ -286,7 +286,7 @@ def to(
         device, dtype = None, device
     if dtype is not None and (not isinstance(dtype, torch.dtype) or dtype not in GEOMETRY):
         raise DTypeError(f"to: dtype must be float32 or float64; got {describe(dtype)}")
-    if device is not None and not isinstance(device, str | torch.device):
+    if device is not None and not isinstance(device, (str, torch.device)):
         raise DTypeError(f"to: device must be a torch.device or its name; got {describe(device)}")
     if device is None and dtype is None:
         raise DTypeError("to: device or dtype must be given; got neither")

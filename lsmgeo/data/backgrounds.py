@@ -97,13 +97,13 @@ def make_background(background: Background) -> BackgroundSource:
         >>> make_background("white")(None, 48, 64).ravel().tolist()
         [1.0, 1.0, 1.0]
     """
-    if isinstance(background, _Plain | _Analytic | _Folder):
+    if isinstance(background, (_Plain, _Analytic, _Folder)):
         return background
     if background == "white":
         return _Plain((1.0, 1.0, 1.0))
     if background == "random":
         return _Analytic()
-    if isinstance(background, str | os.PathLike):
+    if isinstance(background, (str, os.PathLike)):
         return _folder(Path(background))
     if callable(background):
         return background

@@ -126,12 +126,12 @@ class ShapeDataset(Dataset[Sample]):
         self.epoch = check_whole("ShapeDataset", "epoch", epoch, 0)
 
     def __getitem__(self, item: int | tuple[int, int]) -> Sample:
-        pair = item if isinstance(item, tuple | list) else (self.epoch, item)
+        pair = item if isinstance(item, (tuple, list)) else (self.epoch, item)
         if len(pair) != 2:
             raise OptionError(f"ShapeDataset: an item is an index or (epoch, index); got {describe(item)}")
         epoch, index = pair
-        if not isinstance(index, int | np.integer) or isinstance(index, bool) or not 0 <= index < len(self):
-            if isinstance(index, int | np.integer):  # what tells Python's own iteration where to stop
+        if not isinstance(index, (int, np.integer)) or isinstance(index, bool) or not 0 <= index < len(self):
+            if isinstance(index, (int, np.integer)):  # what tells Python's own iteration where to stop
                 raise IndexError(f"ShapeDataset: index must be from 0 to {len(self) - 1}; got {index}")
             raise OptionError(f"ShapeDataset: an item is an index or (epoch, index); got {describe(item)}")
         epoch, index = check_whole("ShapeDataset", "epoch", epoch, 0), int(index)
@@ -304,7 +304,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
 def _view_range(views: int | tuple[int, int] | None) -> tuple[int, int] | None:
     if views is None:
         return None
-    pair = [views, views] if isinstance(views, int) else list(views) if isinstance(views, tuple | list) else []
+    pair = [views, views] if isinstance(views, int) else list(views) if isinstance(views, (tuple, list)) else []
     if len(pair) != 2:
         raise OptionError(f"ShapeDataset: views must be a number, (low, high) or None; got {describe(views)}")
     low, high = (check_whole("ShapeDataset", "views", value, 1) for value in pair)

@@ -110,7 +110,7 @@ def _metadata(values: Any, key: str) -> Metadata:
     if seed is not None:
         seed = check_whole("metadata", "seed", seed, 0)
     if step is not None:
-        if not isinstance(step, int | float) or isinstance(step, bool) or not 0 < step < 1e6:
+        if not isinstance(step, (int, float)) or isinstance(step, bool) or not 0 < step < 1e6:
             raise ValueError(f"depth_step must be a positive number below 1e6 or null; got {describe(step)}")
         step = float(step)
     if not isinstance(size, list) or len(size) != 2:

@@ -171,7 +171,7 @@ class PosedImages:
             DataError: a file is missing, damaged, or not of its camera's size; or the voxels fill no cube.
         """
         chosen = list(range(len(self)) if views is None else views)
-        whole = all(isinstance(view, int | np.integer) and not isinstance(view, bool) for view in chosen)
+        whole = all(isinstance(view, (int, np.integer)) and not isinstance(view, bool) for view in chosen)
         if not chosen or not whole or not all(0 <= view < len(self) for view in chosen):
             raise OptionError(f"sample: views must be numbers from 0 to {len(self) - 1}; got {describe(views)}")
         # All sizes before the first photograph: they are large.

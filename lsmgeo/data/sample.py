@@ -183,7 +183,7 @@ def collate(samples: Sequence[Sample]) -> Batch:
         >>> batch.view_mask.tolist(), batch.name
         ([[True, False, False], [True, True, True]], ('a', 'b'))
     """
-    if not isinstance(samples, Sequence) or isinstance(samples, Sample | str) or not samples:
+    if not isinstance(samples, Sequence) or isinstance(samples, (Sample, str)) or not samples:
         raise DTypeError(f"collate: samples must be a list or tuple with at least one Sample; got {describe(samples)}")
     cameras = [check_sample(sample, f"collate: samples[{i}]") for i, sample in enumerate(samples)]
     first = samples[0]

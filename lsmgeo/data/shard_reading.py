@@ -98,7 +98,7 @@ class ShardSet:
 
     def _locate(self, index: int) -> tuple[int, int]:
         """The number of a shape's shard, and its row in that."""
-        if not isinstance(index, int | np.integer) or isinstance(index, bool) or not 0 <= index < len(self):
+        if not isinstance(index, (int, np.integer)) or isinstance(index, bool) or not 0 <= index < len(self):
             raise OptionError(f"ShardSet: index must be an integer from 0 to {len(self) - 1}; got {describe(index)}")
         number = bisect_right(self._ends, int(index))
         return number, int(index) - (self._ends[number - 1] if number else 0)

@@ -67,7 +67,7 @@ def _facts_of(item: Evidence, asis: Hypothesis) -> list[tuple[str, str]]:
         return [("matched features", text)]
     if isinstance(item, Outlines):
         return [("outlines", f"{len(item.outlines)} seen whole")]
-    if isinstance(item, DepthMaps | StereoPair):
+    if isinstance(item, (DepthMaps, StereoPair)):
         depths = np.concatenate(item.surfaces.depths)
         low, high = np.percentile(depths, (2, 98))
         text = f"{low:.4g} to {high:.4g} (2nd to 98th percentile)"

@@ -95,7 +95,7 @@ def _content(scene: PosedImages, examination: Examination) -> Content:
         return surface_of(scene.voxels)
     points = np.zeros((0, 3))
     for item in examination.evidence:
-        if isinstance(item, DepthMaps | StereoPair):
+        if isinstance(item, (DepthMaps, StereoPair)):
             each = [surface_points(item.surfaces, examination.hypothesis, view) for view in item.surfaces.views]
             points = np.concatenate(each)
     return Content(points[:: max(1, len(points) // MOST_POINTS)])

@@ -332,7 +332,7 @@ class R2N2(Model):
 
 def _initialise(module: nn.Module) -> None:
     """As the original starts: normal weights of variance 4 / (inputs + outputs), shifts of 0.1."""
-    if not isinstance(module, nn.Linear | nn.Conv2d | nn.Conv3d | nn.ConvTranspose3d):
+    if not isinstance(module, (nn.Linear, nn.Conv2d, nn.Conv3d, nn.ConvTranspose3d)):
         return
     nn.init.xavier_normal_(module.weight, sqrt(2))
     if module.bias is not None:

@@ -58,7 +58,7 @@ class Material:
             if len(values) != 3 or not all(0 <= value <= 1 for value in values):
                 raise OptionError(f"Material: {name} must be three numbers in [0, 1]; got {colour!r:.80}")
             object.__setattr__(self, name, values)
-        if not isinstance(self.seed, int | np.integer) or isinstance(self.seed, bool) or self.seed < 0:
+        if not isinstance(self.seed, (int, np.integer)) or isinstance(self.seed, bool) or self.seed < 0:
             raise OptionError(f"Material: seed must be a whole number, 0 at least; got {self.seed!r:.80}")
         if self.texture not in TEXTURES:
             raise OptionError(f"Material: texture must be one of {', '.join(TEXTURES)}; got {self.texture!r}")

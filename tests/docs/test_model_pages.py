@@ -10,8 +10,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import pytest
 
-from lsmgeo import cli
-from lsmgeo.models import commands, create
+from lsmgeo import cli, commands
+from lsmgeo.models import create
 from lsmgeo.models.evaluation import REPORTS
 from lsmgeo.models.training.config import GROUPS, read_config
 

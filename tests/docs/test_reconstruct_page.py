@@ -5,9 +5,8 @@ import re
 import textwrap
 from pathlib import Path
 
-from lsmgeo import classical
+from lsmgeo import classical, commands
 from lsmgeo.metrics import depth_errors
-from lsmgeo.models import commands
 
 ROOT = Path(__file__).resolve().parents[2]
 GUIDE = (ROOT / "docs" / "reconstruct.rst").read_text(encoding="utf-8")

@@ -15,6 +15,8 @@ BAD_LINES = [
     "F.interpolate(x, scale_factor=2, align_corners=True)",
     "y = x / (z + 1e-8)",
     "F.grid_sample(x, g)",
+    "isinstance(value, int | np.integer)",
+    "torch.broadcast_shapes(a, b)",
 ]
 GOOD_LINES = [
     "model.eval()",
@@ -22,6 +24,7 @@ GOOD_LINES = [
     "'weights_only=False'",
     "archive.extractall(folder, filter='data')",
     "near = 1e-6",
+    "isinstance(value, (int, float)) and a | b",
 ]
 
 

@@ -37,7 +37,7 @@ MAY_IMPORT = {
     "fusion": SHARED | {"functional", "kernels"},
     "rays": SHARED | {"functional", "grids", "kernels", "_sites"},
 }
-OUTSIDE_THE_CORE = {"models", "data", "classical", "scenes", "metrics", "cli", "demo", "diagnosis"}
+OUTSIDE_THE_CORE = {"models", "data", "classical", "scenes", "metrics", "cli", "commands", "demo", "diagnosis"}
 # What the parts outside may import of each other; the core is open to all of them.
 MAY_ALSO_IMPORT = {
     "scenes": set(),
@@ -106,7 +106,7 @@ def test_data_and_scenes_stand_below_models(module):
 
 def test_the_models_stand_above_all_but_the_command_line():
     for module, path in MODULES.items():
-        if part(module) not in ("models", "cli"):
+        if part(module) not in ("models", "cli", "commands"):
             assert not any(name.startswith("lsmgeo.models") for name in imported(path, module)), module
 
 
@@ -117,10 +117,10 @@ def test_the_networks_know_nothing_of_training():
         assert not any(name.startswith(above) for name in imported(MODULES[module], module)), module
 
 
-PACKAGES = ("lsmgeo", "lsmgeo.scenes", "lsmgeo.scenes.synthetic13", "lsmgeo.data", "lsmgeo.metrics", "lsmgeo.models")
+PACKAGES = ("lsmgeo.scenes", "lsmgeo.scenes.synthetic13", "lsmgeo.data", "lsmgeo.metrics", "lsmgeo.models")
 
 
-@pytest.mark.parametrize("package", PACKAGES[1:])
+@pytest.mark.parametrize("package", PACKAGES)
 def test_scenes_and_data_import_lightly(package, brought):
     new = {name.split(".")[0] for name in brought[package]}
     later = {"embreex", "manifold3d", "joblib", "distributed", "webdataset", "accelerate", "tensorboard"}
@@ -129,8 +129,10 @@ def test_scenes_and_data_import_lightly(package, brought):
 
 @pytest.mark.parametrize("module", MODULES)
 def test_only_the_program_imports_the_command_line(module):
-    if part(module) not in ("cli", ""):
-        assert not any(part(name) == "cli" for name in imported(MODULES[module], module) if name.startswith("lsmgeo"))
+    if part(module) not in ("cli", "commands", ""):
+        assert not any(
+            part(name) in ("cli", "commands") for name in imported(MODULES[module], module) if name.startswith("lsmgeo")
+        )
 
 
 def test_the_front_page_imports_the_core_alone():
@@ -189,28 +191,39 @@ def test_geometry_is_elementwise(module):
         assert not (isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.MatMult)), node.lineno
 
 
-# One new interpreter imports torch and kornia, which takes seconds, and is forked for each package.
+# One new interpreter imports torch and kornia, which takes seconds, and is forked for each piece of code.
 IMPORTS = """
 import os, sys, warnings, torch, kornia.geometry
 warnings.simplefilter("ignore", DeprecationWarning)  # of forking beside threads
 theirs = set(sys.modules)
-for package in sys.argv[1:]:
+for code in sys.argv[1:]:
     sys.stdout.flush()
     child = os.fork()
     if child == 0:
-        __import__(package)
-        print(package, *sorted(set(sys.modules) - theirs), flush=True)
+        exec(code)
+        print(*sorted(set(sys.modules) - theirs), flush=True)
         os._exit(0)
-    assert os.waitpid(child, 0)[1] == 0, package
+    assert os.waitpid(child, 0)[1] == 0, code
 """
+FIRST_CALLS = """
+views = cameras.orbit(torch.tensor([0.0, 120.0]), 20.0, 2.0, focal_length=250.0, height=192, width=256)
+for name in ("opencv", "opengl", "colmap", "pytorch3d"):
+    parts = getattr(cameras, f"to_{name}")(views)
+    getattr(cameras, f"from_{name}")(*parts, height=192, width=256)
+"""
+CODE = {
+    "lsmgeo": "from lsmgeo import *",
+    "first calls": f"from lsmgeo import *\n{FIRST_CALLS}",
+    **{package: f"import {package}" for package in PACKAGES},
+}
 
 
 @pytest.fixture(scope="module")
 def brought() -> dict[str, set[str]]:
-    """Names of the modules that importing each package brings, beyond those of torch and kornia."""
-    command = [sys.executable, "-c", IMPORTS, *PACKAGES]
+    """Names of the modules that each piece of code imports, beyond those of torch and kornia."""
+    command = [sys.executable, "-c", IMPORTS, *CODE.values()]
     done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
-    return {package: set(names) for package, *names in map(str.split, done.stdout.splitlines())}
+    return {name: set(line.split()) for name, line in zip(CODE, done.stdout.splitlines(), strict=True)}
 
 
 def test_the_import_is_light(brought):
@@ -218,6 +231,35 @@ def test_the_import_is_light(brought):
     assert "lsmgeo.kernels.reference" in ours
     assert {name.split(".")[0] for name in ours} & HEAVY == set()
     assert {part(name) for name in ours if name.startswith("lsmgeo.")} <= set(MAY_IMPORT)
+
+
+def test_the_first_orbit_and_converters_import_nothing(brought):
+    """PyTorch's own helpers can: `torch.broadcast_shapes` takes a third of a second to import sympy."""
+    assert brought["first calls"] - brought["lsmgeo"] == set()
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["train", "--help"]])
+def test_the_command_line_answers_without_pytorch(arguments):
+    code = """
+import sys
+from lsmgeo import cli
+try:
+    cli.main(sys.argv[1:])
+finally:
+    print(*sys.modules, file=sys.stderr)
+"""
+    command = [sys.executable, "-c", code, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
+    assert "lsmgeo" in done.stdout
+    modules = {name.split(".")[0] for name in done.stderr.split()}
+    assert "jsonargparse" in modules
+    assert modules & {"torch", "kornia", "numpy"} == set()
+
+
+def test_the_names_of_the_front_page_are_listed():
+    assert set(lsmgeo.__all__) <= set(dir(lsmgeo))
+    with pytest.raises(AttributeError, match="module 'lsmgeo' has no attribute 'VoxelGird'"):
+        lsmgeo.VoxelGird  # noqa: B018
 
 
 def test_no_test_asserts_a_time():

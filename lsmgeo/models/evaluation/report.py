@@ -188,7 +188,7 @@ def finite(value: Any) -> Any:
     """The same with None for every number that JSON has not."""
     if isinstance(value, Mapping):
         return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return [finite(item) for item in value]
     return _number(value) if isinstance(value, float) else value
 

@@ -373,12 +373,12 @@ def _converted(key: str, value: Any, hint: Any) -> Any:
     kinds = get_args(hint) if get_origin(hint) in (types.UnionType, Union) else (hint,)
     for kind in kinds:
         origin = get_origin(kind) or kind
-        if origin is tuple and isinstance(value, list | tuple):
+        if origin is tuple and isinstance(value, (list, tuple)):
             inner = get_args(kind)
             inner = inner[:1] * len(value) if inner[-1] is Ellipsis else inner
             if len(inner) == len(value):
                 return tuple(_converted(key, one, of) for one, of in zip(value, inner, strict=True))
-        elif origin is float and isinstance(value, int | float) and not isinstance(value, bool):
+        elif origin is float and isinstance(value, (int, float)) and not isinstance(value, bool):
             return float(value)
         elif origin is Mapping and isinstance(value, Mapping):
             return dict(value)

@@ -217,8 +217,8 @@ def _plain(value: Any) -> Any:
     """A value as JSON holds it."""
     if isinstance(value, Mapping):
         return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return [_plain(one) for one in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
-    return value if isinstance(value, str | int | bool | None) else str(value)
+    return value if isinstance(value, (str, int, bool, type(None))) else str(value)

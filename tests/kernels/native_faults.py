@@ -1,7 +1,8 @@
-"""Faults in the C++ kernels: each a substitution in their source, compiled for itself."""
+"""Faults in the C++ kernels: each a substitution in their source. One library has all and makes the one it is told."""
 
 from __future__ import annotations
 
+import ctypes
 import shutil
 import subprocess
 from pathlib import Path
@@ -10,91 +11,112 @@ import lsmgeo
 
 SOURCES = Path(lsmgeo.__file__).parent / "kernels" / "native"
 
-# name: (what stands in the source, what is put in its place)
+# name: (what stands in the source, what is put in the place of the expression between the dollars)
 FAULTS = {
-    "half a pixel": ("const float index = tile.index[axis][s];", "const float index = tile.index[axis][s] + 0.5f;"),
-    "x and y swapped": ("tile.index[0][s] = front ? (slope[0]", "tile.index[0][s] = front ? (slope[1]"),
-    "no front test": ("const bool front = height > threshold;", "const bool front = height != 0.0f;"),
-    "near ignored": ("const float bound = float(call.near) * float(unit);", "const float bound = 0.0f;"),
-    "near ignored by volumes": ("tile.depth[s] > float(call.near) && !view.masked", "!view.masked"),
-    "mask ignored": ("tile.depth[s] > float(call.near) && !view.masked", "tile.depth[s] > float(call.near)"),
-    "floor for nearest": ("nearest && fraction >= 0.5f ? floor + 1.0f : floor", "floor"),
-    "closed image": ("int32_t(index < size - 0.5f)", "int32_t(index < size + 0.5f)"),
-    "border always": ("border = call.border != 0;", "border = true;"),
-    "slope beyond the border": ("index > 0.0f && index < size - 1.0f ? 1.0f : 0.0f", "1.0f"),
-    "weights of x and y swapped": ("tile.weight[1][s] = x * near;", "tile.weight[1][s] = (1.0f - x) * next;"),
-    "last tap dropped": ("tile.weight[7][s] = x * y * z;", "tile.weight[7][s] = 0.0f;"),
-    "edge taps not weighted": (
-        "const float weight = weight_of<DIMS>(tile, s, tap) * factor;",
-        "const float weight = factor;",
-    ),
-    "one channel's tap astray": ("places[2][s] = corner + down;", "places[2][s] = corner;"),
-    "one channel's unread sites": ("values[s] = tile.reads[s] ? values[s] : 0.0f;", ""),
-    "one channel's rest forgotten": ("s < padded; s += LANES", "s + LANES <= n; s += LANES"),
+    "half a pixel": ("const float index = $tile.index[axis][s]$;", "tile.index[axis][s] + 0.5f"),
+    "x and y swapped": ("tile.index[0][s] = front ? ($slope[0]$", "slope[1]"),
+    "no front test": ("const bool front = $height > threshold$;", "height != 0.0f"),
+    "near ignored": ("const float bound = $float(call.near) * float(unit)$;", "0.0f"),
+    "near ignored by volumes": ("$tile.depth[s] > float(call.near)$ && !view.masked", "true"),
+    "mask ignored": ("tile.depth[s] > float(call.near) && $!view.masked$", "true"),
+    "floor for nearest": ("nearest && fraction >= 0.5f ? $floor + 1.0f$ : floor", "floor"),
+    "closed image": ("int32_t($index < size - 0.5f$)", "index < size + 0.5f"),
+    "border always": ("border = $call.border != 0$;", "true"),
+    "slope beyond the border": ("$index > 0.0f && index < size - 1.0f ? 1.0f : 0.0f$", "1.0f"),
+    "weights of x and y swapped": ("tile.weight[1][s] = $x * near$;", "(1.0f - x) * next"),
+    "last tap dropped": ("tile.weight[7][s] = $x * y * z$;", "0.0f"),
+    "edge taps not weighted": ("const float weight = $weight_of<DIMS>(tile, s, tap) * factor$;", "factor"),
+    "one channel's tap astray": ("places[2][s] = $corner + down$;", "corner"),
+    "one channel's unread sites": ("values[s] = $tile.reads[s] ? values[s] : 0.0f$;", "values[s]"),
+    "one channel's rest forgotten": ("$s < padded$; s += LANES", "s + LANES <= n"),
     "tiles at the volume's edge passed over": (
-        "if (index[axis][0] < -1.01 && index[axis][1] < -1.01) return true;",
-        "if (index[axis][0] < 0.4 && index[axis][1] < 0.4) return true;",
+        "if ($index[axis][0] < -1.01 && index[axis][1] < -1.01$) return true;",
+        "index[axis][0] < 0.4 && index[axis][1] < 0.4",
     ),
-    "rest of the channels forgotten": ("for (; c < channels; c++) body", "for (; c < channels - 1; c++) body"),
+    "rest of the channels forgotten": ("for (; $c < channels$; c++) body", "c < channels - 1"),
     "slope with the wrong sign": (
-        "slope[tap][axis] = tap >> axis & 1 ? rest : -rest;",
-        "slope[tap][axis] = tap >> axis & 1 ? -rest : rest;",
+        "slope[tap][axis] = $tap >> axis & 1 ? rest : -rest$;",
+        "tap >> axis & 1 ? -rest : rest",
     ),
-    "depth without its slope": ("rows[2][s] += float(by_height);", ""),
-    "height's part forgotten": (
-        "rows[2][s] = -(rows[0][s] * tile.index[0][s]",
-        "rows[2][s] = -(0.0f * tile.index[0][s]",
+    "depth without its slope": ("rows[2][s] += $float(by_height)$;", "0.0f"),
+    "height's part forgotten": ("rows[2][s] = -($rows[0][s]$ * tile.index[0][s]", "0.0f"),
+    "inverse depth's part forgotten": (
+        "by_z[s] -= $double(by_plane) * tile.plane[row][s] * tile.depth[s]$;",
+        "0.0",
     ),
-    "inverse depth's part forgotten": ("by_z[s] -= double(by_plane) * tile.plane[row][s] * tile.depth[s];", ""),
     "direction's slope not projected": (
-        "(by_direction[row][s] - along * tile.direction[row][s])",
+        "($by_direction[row][s] - along * tile.direction[row][s]$)",
         "by_direction[row][s]",
     ),
     "direction not normalised": (
-        "tile.shrink[s] = away ? 1.0f / std::sqrt(away ? squares : 1.0f) : 0.0f;",
-        "tile.shrink[s] = 1.0f;",
+        "tile.shrink[s] = $away ? 1.0f / std::sqrt(away ? squares : 1.0f) : 0.0f$;",
+        "1.0f",
     ),
     "direction in y, z, x order": (
-        "*out++ = tile.direction[row][s];",
-        "*out++ = tile.direction[(row + 1) % 3][s];",
+        "*out++ = $tile.direction[row][s]$;",
+        "tile.direction[(row + 1) % 3][s]",
     ),
-    "mean over all views": (
-        "mean += read<W>(values + v * step) * share;",
-        "mean += read<W>(values + v * step) * 0.3333333f;",
-    ),
-    "blind views counted": ("if (!tiles[v].visible[s]) continue;\n        float *out", "float *out"),
+    "mean over all views": ("mean += read<W>(values + v * step) * $share$;", "0.3333333f"),
+    "blind views counted": ("if ($!tiles[v].visible[s]$) continue;\n        float *out", "false"),
     "unbiased variance": (
-        "result += apart * apart * share;",
-        "result += apart * apart / float(count > 1 ? count - 1 : 1);",
+        "result += apart * apart * $share$;",
+        "1.0f / float(count > 1 ? count - 1 : 1)",
     ),
-    "maximum's gradient to all views": ("part = taker == int32_t(v) ? gradient : Floats<W>{};", "part = gradient;"),
-    "mean's gradient not shared": ("Floats<W> part = gradient * share;", "Floats<W> part = gradient;"),
+    "maximum's gradient to all views": (
+        "part = $taker == int32_t(v) ? gradient : Floats<W>{}$;",
+        "gradient",
+    ),
+    "mean's gradient not shared": ("Floats<W> part = gradient * $share$;", "1.0f"),
     "first chunk's channels for all": (
-        "const S *source = source_of<S>(call, scene, view) + channel;",
-        "const S *source = source_of<S>(call, scene, view);",
+        "const S *source = source_of<S>(call, scene, view) + $channel$;",
+        "0",
     ),
-    "gradient not cleared": ("if (!call.source_gradient || call.accumulate) return;", "return;"),
-    "bfloat16 cut off": ("(bits + 0x7fff + (bits >> 16 & 1)) >> 16;", "bits >> 16;"),
-    "float16 denormals lost": ("magnitude < (113u << 23) ? small : normal", "magnitude < (113u << 23) ? 0u : normal"),
+    "gradient not cleared": ("if ($!call.source_gradient || call.accumulate$) return;", "true"),
+    "bfloat16 cut off": ("$(bits + 0x7fff + (bits >> 16 & 1)) >> 16$;", "bits >> 16"),
+    "float16 denormals lost": ("magnitude < (113u << 23) ? $small$ : normal", "0u"),
 }
+
+NONE = 0
+NUMBERS = {name: number for number, name in enumerate(FAULTS, NONE + 1)}
 
 
 def compiler() -> str | None:
     return shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 
 
-def build(folder: Path, fault: str | None) -> Path:
-    """The kernels with one fault, or none, for the plainest instruction set and quickly compiled."""
-    found = 0
+def with_faults(text: str, found: set[str]) -> str:
+    """A source in which ``lsmgeo_fault`` decides between what stands there and each fault; adds the faults' names."""
+    places = []
+    for name, (there, instead) in FAULTS.items():
+        before, sound, after = there.split("$")
+        start = text.find(before + sound + after)
+        if start >= 0:
+            found.add(name)
+            start += len(before)
+            places.append((start, start + len(sound), f"(lsmgeo_fault == {NUMBERS[name]} ? ({instead}) : ({sound}))"))
+    last = len(text)
+    for start, end, switch in sorted(places, reverse=True):
+        assert end <= last, f"faults overlap in {text[start:end]!r}"
+        text = text[:start] + switch + text[end:]
+        last = start
+    return text
+
+
+def build(folder: Path) -> Path:
+    """The kernels with all faults, for the plainest instruction set and quickly compiled."""
+    found: set[str] = set()
     for source in SOURCES.iterdir():
-        text = source.read_text(encoding="utf-8")
-        if fault is not None:
-            there, instead = FAULTS[fault]
-            found += text.count(there)
-            text = text.replace(there, instead)
-        (folder / source.name).write_text(text, encoding="utf-8")
-    assert fault is None or found, f"{fault}: the source has changed"
+        (folder / source.name).write_text(with_faults(source.read_text(encoding="utf-8"), found), encoding="utf-8")
+    assert not FAULTS.keys() - found, f"the source has changed: {FAULTS.keys() - found}"
+    main = folder / "kernels.cpp"
+    switch = f'extern "C" __attribute__((visibility("default"))) int lsmgeo_fault = {NONE};\n'
+    main.write_text(switch + main.read_text(encoding="utf-8"), encoding="utf-8")
     library = folder / "kernels.so"
     flags = ["-std=c++17", "-O0", "-w", "-fPIC", "-shared", "-DLSMGEO_ONE_SET"]
-    subprocess.run([str(compiler()), *flags, "-o", str(library), str(folder / "kernels.cpp")], check=True)
+    subprocess.run([str(compiler()), *flags, "-o", str(library), str(main)], check=True)
     return library
+
+
+def commit(library: ctypes.CDLL, fault: str | None) -> None:
+    """Have the kernels make a fault, or none."""
+    ctypes.c_int.in_dll(library, "lsmgeo_fault").value = NONE if fault is None else NUMBERS[fault]

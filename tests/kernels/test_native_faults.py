@@ -10,7 +10,7 @@ import torch
 
 from lsmgeo.kernels import cpu
 from tests.kernels.cases import CASES, HALF
-from tests.kernels.native_faults import FAULTS, build, compiler
+from tests.kernels.native_faults import FAULTS, build, commit, compiler
 
 pytestmark = [
     pytest.mark.skipif(compiler() is None, reason="needs a C++ compiler"),
@@ -18,9 +18,15 @@ pytestmark = [
 ]
 
 
-def _noticed(monkeypatch, folder, fault: str | None) -> list[str]:
-    library = cpu.load(build(folder, fault))
-    assert isinstance(library, ctypes.CDLL), library
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    loaded = cpu.load(build(tmp_path_factory.mktemp("faults")))
+    assert isinstance(loaded, ctypes.CDLL), loaded
+    return loaded
+
+
+def _noticed(monkeypatch, library, fault: str | None) -> list[str]:
+    commit(library, fault)
     monkeypatch.setattr(cpu, "_library", lambda: library)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)  # so that channels are split in chunks
     found = []
@@ -34,10 +40,10 @@ def _noticed(monkeypatch, folder, fault: str | None) -> list[str]:
     return found
 
 
-def test_the_kernels_as_they_are(monkeypatch, tmp_path):
-    assert _noticed(monkeypatch, tmp_path, None) == []
+def test_the_kernels_as_they_are(monkeypatch, library):
+    assert _noticed(monkeypatch, library, None) == []
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_noticed(monkeypatch, tmp_path, fault):
-    assert _noticed(monkeypatch, tmp_path, fault), f"no comparison notices: {fault}"
+def test_a_fault_is_noticed(monkeypatch, library, fault):
+    assert _noticed(monkeypatch, library, fault), f"no comparison notices: {fault}"

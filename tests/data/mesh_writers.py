@@ -35,12 +35,15 @@ def mtl(names: Sequence[str]) -> bytes:
     ).encode()
 
 
-def ply(form: str, *, triangles: bool = False, tinted: str = "face", count: int | None = None) -> bytes:
-    """The cube, with an element that no reader wants before the faces; colours at "face" or "vertex"."""
+def ply(form: str, *, triangles: bool = False, tinted: str = "face", mixed: bool = False) -> bytes:
+    """The cube, with an element that no reader wants before the faces, its lists of differing length if wanted.
+
+    Colours are at "face" or "vertex".
+    """
     faces = FANS.tolist() if triangles else QUADS
     tints = np.repeat(TINTS, 2, 0) if triangles else TINTS
     at = {"vertex": [], "face": []} | {tinted: ["property uchar red", "property uchar green", "property uchar blue"]}
-    head = ["ply", f"format {form} 1.0", "comment made here", f"element vertex {len(CUBE) if count is None else count}"]
+    head = ["ply", f"format {form} 1.0", "comment made here", f"element vertex {len(CUBE)}"]
     head += ["property double x", "property float y", "property float z", *at["vertex"]]
     head += ["element strange 2", "property list uchar short odd", "property int even"]
     head += [f"element face {len(faces)}", "property list uchar int vertex_indices", *at["face"], "end_header\n"]
@@ -51,7 +54,7 @@ def ply(form: str, *, triangles: bool = False, tinted: str = "face", count: int 
         tint = TINTS[index % 6].tolist() if tinted == "vertex" else []
         body += struct.pack(f"{order}dff", *point) + bytes(tint)
         rows.append(" ".join(map(str, [*point, *tint])))
-    for size in (0, 3):
+    for size in (0 if mixed else 3, 3):
         body += struct.pack(f"{order}B{size}hi", size, *range(size), -7)
         rows.append(" ".join(map(str, [size, *range(size), -7])))
     for face, tint in zip(faces, tints.tolist(), strict=True):
@@ -124,7 +127,7 @@ def samples() -> dict[str, bytes]:
     return {
         "quads.obj": obj(),
         "backwards.obj": obj(backwards=True, end="\r\n"),
-        "text.ply": ply("ascii"),
+        "text.ply": ply("ascii", mixed=True),
         "little.ply": ply("binary_little_endian"),
         "big.ply": ply("binary_big_endian"),
         "triangles.ply": ply("binary_little_endian", triangles=True),

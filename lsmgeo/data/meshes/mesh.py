@@ -1,0 +1,147 @@
+"""Triangle meshes: one plain value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lsmgeo._checks import LARGEST_COUNT, check_choice, describe
+from lsmgeo.data.mesh_topology import is_watertight
+from lsmgeo.errors import DTypeError, OptionError, ShapeError
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = ["DEFAULT_COLOUR", "Mesh", "check_mesh", "from_trimesh", "normalise"]
+
+# What has no colour of its own: the grey of a default `lsmgeo.scenes.Material`.
+DEFAULT_COLOUR = (0.7, 0.7, 0.7)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles, checked when made; arrays must not be changed afterwards.
+
+    Attributes:
+        vertices: (N, 3) float64, finite, world units.
+        faces: (F, 3) int64 vertex numbers, F >= 1; seen from outside, counter-clockwise.
+        face_colours: (F, 3) float32 RGB in [0, 1], or None.
+
+    Raises:
+        ShapeError: a wrong shape, no face.
+        DTypeError: no array of numbers.
+        OptionError: a face that names no vertex, a number that is not finite, a colour outside [0, 1].
+
+    Example:
+        >>> import numpy as np
+        >>> from lsmgeo.data import Mesh
+        >>> Mesh(np.eye(3), np.array([[0, 1, 2]])).watertight
+        False
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    face_colours: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        """Check and normalise the fields."""
+        vertices = _array("vertices", self.vertices, "(N, 3) numbers", "fiu", np.float64)
+        faces = _array("faces", self.faces, "(F, 3) whole numbers", "iu", np.int64)
+        if not 1 <= len(faces) <= LARGEST_COUNT or len(vertices) > LARGEST_COUNT:
+            raise ShapeError(f"Mesh: expected at least one face, fewer than 2^31; got {len(faces)}")
+        if not np.isfinite(vertices).all():
+            raise OptionError("Mesh: vertices must be finite; got a NaN or an infinity")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise OptionError(
+                f"Mesh: faces must name vertices 0 to {len(vertices) - 1}; got {faces.min()}..{faces.max()}"
+            )
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+        if self.face_colours is None:
+            return
+        colours = _array("face_colours", self.face_colours, "(F, 3) numbers", "f", np.float32)
+        if len(colours) != len(faces):
+            raise ShapeError(f"Mesh: face_colours must be ({len(faces)}, 3), one a face; got {colours.shape}")
+        if not ((colours >= 0) & (colours <= 1)).all():
+            raise OptionError(f"Mesh: face_colours must be in [0, 1]; got {colours.min()}..{colours.max()}")
+        object.__setattr__(self, "face_colours", colours)
+
+    def __repr__(self) -> str:
+        return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
+
+    @cached_property
+    def watertight(self) -> bool:
+        """Whether every edge belongs to exactly two faces; vertices in one place count as one."""
+        return is_watertight(self.vertices, self.faces)
+
+    @cached_property
+    def bounds(self) -> np.ndarray:
+        """(2, 3): the least and the greatest x, y, z of the vertices that faces use."""
+        used = self.vertices[np.unique(self.faces)]
+        return np.stack((used.min(0), used.max(0)))
+
+
+def _array(name: str, value: object, expected: str, kinds: str, dtype: type) -> np.ndarray:
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in kinds:
+        raise DTypeError(f"Mesh: {name} must be a numpy array, {expected}; got {describe(value)}")
+    if value.ndim != 2 or value.shape[1] != 3:
+        raise ShapeError(f"Mesh: {name} must be {expected}; got {value.shape}")
+    return np.ascontiguousarray(value, dtype)
+
+
+def check_mesh(who: str, mesh: object) -> None:
+    """Require a `Mesh`."""
+    if not isinstance(mesh, Mesh):
+        raise DTypeError(f"{who}: mesh must be a lsmgeo.data.Mesh (see from_trimesh); got {describe(mesh)}")
+
+
+def from_trimesh(mesh: trimesh.Trimesh) -> Mesh:
+    """A `trimesh.Trimesh` as a `Mesh`; colours of faces or vertices are kept, textures are not.
+
+    Example:
+        >>> import trimesh
+        >>> from lsmgeo.data import from_trimesh
+        >>> from_trimesh(trimesh.creation.box((1, 1, 1))).watertight
+        True
+    """
+    visual = getattr(mesh, "visual", None)
+    colours = None
+    if visual is not None and visual.defined and visual.kind in ("face", "vertex"):
+        colours = np.asarray(visual.face_colors)[:, :3].astype(np.float32) / 255
+    return Mesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64), colours)
+
+
+def normalise(mesh: Mesh, *, to: str = "diagonal") -> Mesh:
+    """Move the centre of the bounding box to the origin and scale it to unit size.
+
+    Args:
+        mesh: any mesh.
+        to: "diagonal" makes the box's diagonal 1, as in ShapeNet, and "longest" its longest side.
+
+    Returns:
+        The mesh, within [-0.5, 0.5]^3.
+
+    Raises:
+        DTypeError: not a `Mesh`.
+        OptionError: another `to`, or a mesh that is a single point.
+
+    Example:
+        >>> import trimesh
+        >>> from lsmgeo.data import from_trimesh, normalise
+        >>> mesh = normalise(from_trimesh(trimesh.creation.box((2, 3, 6))))
+        >>> mesh.bounds[1] * 14
+        array([2., 3., 6.])
+    """
+    who = "normalise"
+    check_mesh(who, mesh)
+    check_choice(who, "to", to, ("diagonal", "longest"))
+    low, high = mesh.bounds
+    extent = high - low
+    size = float(np.linalg.norm(extent) if to == "diagonal" else extent.max())
+    if not 0 < size < np.inf:
+        raise OptionError(f"{who}: mesh must have a size; got one of {size}")
+    # Halves first: the sum of two large coordinates could overflow.
+    return replace(mesh, vertices=(mesh.vertices - (0.5 * low + 0.5 * high)) / size)

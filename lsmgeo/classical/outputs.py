@@ -16,6 +16,7 @@ from lsmgeo.classical.report_page import ReportPicture, ReportView, make_page
 from lsmgeo.classical.surface import write_mesh
 from lsmgeo.data.cameras_json import FORMAT, NAME, VERSION
 from lsmgeo.data.files import write_atomic, write_point_cloud
+from lsmgeo.data.png import encode_png
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
@@ -82,9 +83,9 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
         step = max(float(one.depth.max()), 1e-30) / STEPS
         height, width = one.depth.shape
         shown = (one.image.permute(1, 2, 0) * 255).round().clamp(0, 255).to(torch.uint8).numpy()
-        contents[f"images/{name}.png"] = pictures.png(shown)
+        contents[f"images/{name}.png"] = encode_png(shown)
         contents[f"depth/{name}.png"] = pictures.depth_as_png16(one.depth, step)
-        contents[f"pictures/{name}.png"] = pictures.png(pictures.coloured_depth(one.depth, one.depth > 0))
+        contents[f"pictures/{name}.png"] = encode_png(pictures.coloured_depth(one.depth, one.depth > 0))
         entries.append(
             {
                 "file": f"images/{name}.png",

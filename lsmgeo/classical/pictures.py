@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lsmgeo.cameras import CameraTensors
     from lsmgeo.classical.outputs import Looked
 
-__all__ = ["coloured_depth", "depth_as_png16", "depth_limits", "png", "summary"]
+__all__ = ["coloured_depth", "depth_as_png16", "depth_limits", "summary"]
 
 # Of the summary, in inches: its width, what lies between its panels, below them and above.
 WIDTH, GAP, BELOW, ABOVE = 11.0, 0.25, 0.75, 0.75
@@ -26,15 +26,6 @@ DPI = 100
 # Degrees by which the points are seen from aside.
 ASIDE = 25.0
 MOST_DRAWN = 150_000
-
-
-def png(image: np.ndarray) -> bytes:
-    """Encode (h, w), (h, w, 3) or (h, w, 4) uint8, or (h, w) uint16, as PNG."""
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="PNG")
-    return buffer.getvalue()
 
 
 def depth_as_png16(depth: torch.Tensor, unit: float) -> bytes:

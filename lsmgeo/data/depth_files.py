@@ -55,7 +55,7 @@ class DepthPng(DepthFile):
     def read(self, size: tuple[int, int]) -> np.ndarray:
         """(H, W) float32 camera z, 0 where there is none."""
         stored = self._alike(size) if self.any_size else size
-        steps = decode_png(read_bytes(self.path, 4096 + 4 * MAX_PIXELS), stored, DEPTH, self.path, extras=True)
+        steps = decode_png(read_bytes(self.path, 4096 + 4 * MAX_PIXELS), stored, DEPTH, self.path)
         if stored != size:
             # Whole numbers: exactly the rule, whatever the sizes.
             rows, columns = ((2 * np.arange(n) + 1) * m // (2 * n) for n, m in zip(size, stored, strict=True))

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 
 from lsmgeo.cameras import to_colmap, to_opengl
 from lsmgeo.data.cameras_json import FORMAT, NAME, VERSION
 from lsmgeo.data.files import MAX_PIXELS, child, image_size, read_bytes, read_cut_out, read_image, write_atomic
 from lsmgeo.data.folders import atomic_folder
+from lsmgeo.data.png import encode_png
 from lsmgeo.errors import DataError, OptionError
 
 if TYPE_CHECKING:
@@ -197,17 +196,9 @@ def _write_pictures(images: PosedImages, names: list[str], folder: Path) -> None
             content = read_bytes(source, 4096 + 8 * MAX_PIXELS)
         else:
             pixels = read_cut_out(source, size) if images.cut_out else read_image(source, size)
-            content = _png(lens.straighten(pixels))
+            content = encode_png(lens.straighten(pixels))
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(child(folder, name, source), content)
-
-
-def _png(pixels: np.ndarray) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "PNG")
-    return buffer.getvalue()
 
 
 def _write_json(path: Path, values: dict[str, Any]) -> None:

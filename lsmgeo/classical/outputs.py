@@ -16,7 +16,7 @@ from lsmgeo.classical.report_page import ReportPicture, ReportView, make_page
 from lsmgeo.classical.surface import write_mesh
 from lsmgeo.data.cameras_json import FORMAT, NAME, VERSION
 from lsmgeo.data.files import write_atomic, write_point_cloud
-from lsmgeo.data.png import encode_png
+from lsmgeo.data.images import encode_png
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:

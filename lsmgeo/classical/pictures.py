@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from lsmgeo.data.png import encode_png
+from lsmgeo.data.images import encode_png
 from lsmgeo.errors import OptionError
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lsmgeo._checks import check_choice, check_number, describe
 from lsmgeo.data import PosedImages
-from lsmgeo.data.files import read_cut_out
+from lsmgeo.data.images import read_cut_out
 from lsmgeo.errors import DataError, OptionError, ShapeError
 
 __all__ = ["mask_folder", "signed_distance", "silhouettes"]

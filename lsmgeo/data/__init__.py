@@ -7,7 +7,8 @@ from lsmgeo.data.colmap import read_colmap
 from lsmgeo.data.convert_set import convert_set
 from lsmgeo.data.depth_files import DepthFile, DepthPng
 from lsmgeo.data.detect import FORMATS, Format, detect, open_scene
-from lsmgeo.data.files import atomic_file, read_image, write_atomic, write_point_cloud
+from lsmgeo.data.files import atomic_file, write_atomic, write_point_cloud
+from lsmgeo.data.images import read_image
 from lsmgeo.data.lenses import Lens
 from lsmgeo.data.llff import read_llff
 from lsmgeo.data.loading import EpochSampler, ShapeDataset

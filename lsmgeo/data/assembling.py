@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from lsmgeo.cameras import from_opencv
 from lsmgeo.data.posed import PosedImages
 from lsmgeo.errors import DataError, LsmGeoError
 
@@ -15,12 +16,22 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    import numpy.typing as npt
+
     from lsmgeo.cameras import CameraTensors
     from lsmgeo.data.depth_files import DepthFile
     from lsmgeo.data.lenses import Lens
-    from lsmgeo.data.posed import SparsePoints
+    from lsmgeo.data.posed import SparsePoints, Voxels
 
-__all__ = ["as_data_error", "assemble", "check_intrinsics", "check_picture", "check_rotation"]
+__all__ = [
+    "as_data_error",
+    "assemble",
+    "check_intrinsics",
+    "check_last_row",
+    "check_picture",
+    "check_rotation",
+    "make_cameras",
+]
 
 # An image server's largest photographs have such sides; what is beyond is a damaged number.
 MAX_SIDE = 1 << 17
@@ -73,6 +84,16 @@ def check_rotation(rotation: np.ndarray, file: Path, where: str) -> None:
         raise DataError(file, f"{where}: the rotation is scaled by {scale:.6g}; divide it by that")
 
 
+def check_last_row(pose: np.ndarray, file: Path, what: str) -> None:
+    """Check that the last row of a pose, (4, 4), is 0 0 0 1.
+
+    Raises:
+        DataError: it is another one.
+    """
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise DataError(file, f"{what} must have the last row 0 0 0 1")
+
+
 def check_picture(stated: tuple[float, float], found: tuple[int, int], picture: Path, file: Path, where: str) -> None:
     """Compare the (height, width) that a camera is made for with that of its picture.
 
@@ -87,6 +108,26 @@ def check_picture(stated: tuple[float, float], found: tuple[int, int], picture: 
         )
 
 
+def make_cameras(
+    intrinsics: npt.ArrayLike,
+    rotations: npt.ArrayLike,
+    translations: npt.ArrayLike,
+    sizes: Sequence[tuple[int, int]],
+    file: Path,
+    *,
+    pixel_center: str = "integer",
+) -> CameraTensors:
+    """Make cameras (V,) of K (V, 3, 3), world-to-camera R (V, 3, 3) and t (V, 3), and (height, width) of each picture.
+
+    Raises:
+        DataError: one of them is no camera; ``file`` states it.
+    """
+    K, R, t = (torch.from_numpy(np.array(part, np.float64)) for part in (intrinsics, rotations, translations))
+    height, width = torch.tensor(sizes).unbind(-1)
+    with as_data_error(file):
+        return from_opencv(K, R, t, height, width, pixel_center=pixel_center)
+
+
 def assemble(
     names: Sequence[str],
     paths: Sequence[Path],
@@ -98,6 +139,8 @@ def assemble(
     points: SparsePoints | None = None,
     depths: Sequence[DepthFile | None] = (),
     cut_out: bool = False,
+    voxels: Voxels | None = None,
+    category: str | None = None,
 ) -> PosedImages:
     """Make a scene of what a reader has found; photographs with a lens get the camera of what it straightens them to.
 
@@ -111,6 +154,8 @@ def assemble(
         points: sparse points, their observations in straightened pixels.
         depths: one a photograph, or nothing.
         cut_out: as in `PosedImages`.
+        voxels: as in `PosedImages`.
+        category: as in `PosedImages`.
 
     Raises:
         DataError: a name is given twice, or a lens cannot be straightened.
@@ -133,4 +178,6 @@ def assemble(
         lenses=tuple(lenses) if any(bent) else None,
         depths=tuple(depths) if any(depth is not None for depth in depths) else None,
         cut_out=cut_out,
+        voxels=voxels,
+        category=category,
     )

@@ -11,12 +11,11 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from lsmgeo._checks import check_number, describe
-from lsmgeo.data.files import child, read_image
+from lsmgeo.data.files import child
+from lsmgeo.data.images import SUFFIXES, read_image
 from lsmgeo.errors import DataError, OptionError
 
 __all__ = ["Background", "BackgroundError", "BackgroundSource", "make_background"]
-
-SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 class BackgroundError(DataError):

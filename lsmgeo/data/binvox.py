@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from lsmgeo._checks import check_choice
-from lsmgeo.data.files import parse_floats, parse_ints, read_bytes, refuse_unreadable
+from lsmgeo.data.files import one_file, parse_floats, parse_ints, plain_files, read_bytes, refuse_unreadable
 from lsmgeo.data.posed import Voxels
 from lsmgeo.errors import DataError, LsmGeoError
 from lsmgeo.grids import VoxelGrid
@@ -17,8 +17,9 @@ from lsmgeo.grids import VoxelGrid
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["PLACEMENTS", "binvox_files", "is_binvox", "read_binvox"]
+__all__ = ["PATTERN", "PLACEMENTS", "is_binvox", "read_binvox"]
 
+PATTERN = "*.binvox"
 PLACEMENTS = ("header", "centred")
 SIGNATURE = b"#binvox 1"
 MAX_HEADER_BYTES = 1024
@@ -28,15 +29,10 @@ MAX_VOXELS = 1 << 28
 MAX_BYTES = MAX_HEADER_BYTES + 2 * MAX_VOXELS
 
 
-def binvox_files(folder: Path) -> list[Path]:
-    """The ``*.binvox`` files of a folder, sorted."""
-    return sorted(path for path in folder.glob("*.binvox") if path.is_file())
-
-
 def is_binvox(path: Path) -> bool:
     """Whether a file is of this format by its first bytes, or a folder holds such files."""
     if path.is_dir():
-        return bool(binvox_files(path))
+        return bool(plain_files(path, PATTERN))
     with path.open("rb") as stream:
         return stream.read(len(SIGNATURE)) == SIGNATURE
 
@@ -66,13 +62,7 @@ def read_binvox(path: str | Path, *, placement: str = "header") -> Voxels:
         OptionError: another placement.
     """
     check_choice("read_binvox", "placement", placement, PLACEMENTS)
-    path = Path(path)
-    if path.is_dir():
-        files = binvox_files(path)
-        if len(files) != 1:
-            found = ", ".join(file.name for file in files[:5]) or "none"
-            raise DataError(path, f"expected one *.binvox file; found {found}")
-        path = files[0]
+    path = one_file(Path(path), PATTERN)
     content = read_bytes(path, MAX_BYTES)
     side, translate, scale, begin = _read_header(content, path)
     runs = np.frombuffer(content, np.uint8, offset=begin)

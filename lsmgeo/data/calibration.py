@@ -11,6 +11,7 @@ import numpy as np
 
 from lsmgeo.data.assembling import MAX_SIDE, check_intrinsics, check_rotation
 from lsmgeo.data.files import child, refuse_unreadable
+from lsmgeo.data.images import SUFFIXES
 from lsmgeo.data.isolated import isolated
 from lsmgeo.data.lenses import Lens
 from lsmgeo.data.storage import is_storage, parse_storage
@@ -36,7 +37,6 @@ COUNTS = {"perspective": (4, 5, 8, 12, 14), "fisheye": (4,)}
 # Names are compared without underscores and capitals, in which the samples of several years differ.
 MATRICES = ("cameramatrix", "intrinsicmatrix", "m", "k")
 DISTORTIONS = ("distortioncoefficients", "distcoeffs", "distcoeff", "d")
-PICTURES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +294,7 @@ def _rig(entries: Entries, file: Path) -> Rig | None:
 
 
 def _are_pictures(names: tuple[str, ...]) -> bool:
-    return bool(names) and all(name.lower().endswith(PICTURES) for name in names)
+    return bool(names) and all(name.lower().endswith(SUFFIXES) for name in names)
 
 
 def _pictures(file: Path, names: tuple[str, ...]) -> tuple[tuple[Path, ...], ...]:

@@ -6,13 +6,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from lsmgeo._checks import describe
-from lsmgeo.cameras import from_opencv
-from lsmgeo.data.assembling import as_data_error, assemble, check_intrinsics, check_picture, check_rotation
+from lsmgeo.data.assembling import (
+    assemble,
+    check_intrinsics,
+    check_last_row,
+    check_picture,
+    check_rotation,
+    make_cameras,
+)
 from lsmgeo.data.depth_files import DepthPng
-from lsmgeo.data.files import child, has_alpha, image_size, refuse_unreadable
+from lsmgeo.data.files import child, refuse_unreadable
+from lsmgeo.data.images import has_alpha, image_size
 from lsmgeo.data.json_files import peek_json, read_json, take_array, take_number, take_text
 from lsmgeo.data.posed import PosedImages
 from lsmgeo.errors import DataError
@@ -109,10 +115,7 @@ def read_cameras_json(path: str | Path) -> PosedImages:
         poses[view] = _pose(entry, file, where)
         check_rotation(poses[view, :, :3], file, where)
         depths.append(_depth(entry, file, where))
-    height, width = torch.tensor(sizes).unbind(-1)
-    K, R, t = (torch.from_numpy(array.copy()) for array in (intrinsics, poses[:, :, :3], poses[:, :, 3]))
-    with as_data_error(file):
-        cameras = from_opencv(K, R, t, height, width, pixel_center=center)
+    cameras = make_cameras(intrinsics, poses[:, :, :3], poses[:, :, 3], sizes, file, pixel_center=center)
     return assemble(names, paths, cameras, "cameras", file=file, depths=depths, cut_out=any(map(has_alpha, paths)))
 
 
@@ -138,6 +141,5 @@ def _pose(entry: dict[str, Any], file: Path, where: str) -> np.ndarray:
         R, t = take_array(entry, "R", (3, 3), file, where), take_array(entry, "t", (3,), file, where)
         return np.column_stack((R, t))
     pose = take_array(entry, "cam_from_world", (4, 4), file, where)
-    if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise DataError(file, f"{where}: the last row of cam_from_world must be 0 0 0 1")
+    check_last_row(pose, file, f"{where}: cam_from_world")
     return pose[:3]

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from lsmgeo.cameras import from_colmap
-from lsmgeo.data import colmap_binary, colmap_text
 from lsmgeo.data.assembling import as_data_error, assemble
+from lsmgeo.data.colmap_model import read_model
 from lsmgeo.data.files import child, refuse_unreadable
 from lsmgeo.data.posed import Observations, PosedImages, SparsePoints
 from lsmgeo.errors import DataError
@@ -61,7 +61,7 @@ def read_colmap(path: str | Path, images: str | Path | None = None) -> PosedImag
     if found is None:
         raise DataError(path, "holds no COLMAP model (cameras and images, .bin or .txt)")
     folder, form = found
-    model = colmap_binary.read_model(folder) if form == "bin" else colmap_text.read_model(folder)
+    model = read_model(folder, form)
     file = folder / f"images.{form}"
     if not model.images:
         raise DataError(file, "holds no photograph")
@@ -109,9 +109,8 @@ def _sparse_points(
 ) -> SparsePoints | None:
     if model.points is None:
         return None
-    identifiers, positions, colours = model.points
-    ranks = np.argsort(identifiers, kind="stable")
-    ordered = identifiers[ranks]
+    ranks = np.argsort(model.points["id"], kind="stable")
+    ordered = model.points["id"][ranks]
     observations = []
     for entry in entries:
         known = entry.point_ids != -1
@@ -127,4 +126,4 @@ def _sparse_points(
             pixels = lens.straighten_pixels(pixels)
         shown = np.isfinite(pixels).all(1)
         observations.append(Observations(ranks[slots][shown], pixels[shown]))
-    return SparsePoints(positions, colours, tuple(observations))
+    return SparsePoints(model.points["position"].copy(), model.points["colour"].copy(), tuple(observations))

@@ -1,34 +1,30 @@
-"""What a COLMAP model holds, as its files state it, and the checks that its text and binary forms share."""
+"""A COLMAP model as its files state it, text or binary, with the checks that both forms share.
+
+Binary files are little-endian, and every count is compared with the bytes left before it is used.
+"""
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from lsmgeo.data.files import MAX_TEXT_BYTES, parse_floats, parse_ints, read_bytes, read_text
 from lsmgeo.data.lenses import Lens
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
-__all__ = [
-    "CAMERA_MODELS",
-    "MAX_CAMERA_BYTES",
-    "MAX_MODEL_BYTES",
-    "ColmapCamera",
-    "ColmapImage",
-    "ColmapModel",
-    "check_model",
-    "check_points",
-    "refuse_model",
-]
+__all__ = ["ColmapCamera", "ColmapImage", "ColmapModel", "read_model"]
 
 MAX_CAMERA_BYTES = 1 << 24
 MAX_MODEL_BYTES = 1 << 31
 
-# Binary id -> (name, number of parameters), as COLMAP numbers them.
+# Binary id -> (name, number of parameters), as COLMAP numbers them; no number for what OpenCV does not have.
 CAMERA_MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -37,21 +33,21 @@ CAMERA_MODELS = {
     4: ("OPENCV", 8),
     5: ("OPENCV_FISHEYE", 8),
     6: ("FULL_OPENCV", 12),
+    7: ("FOV", None),
     8: ("SIMPLE_RADIAL_FISHEYE", 4),
     9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", None),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", None),
+    12: ("SIMPLE_DIVISION", None),
+    13: ("DIVISION", None),
     14: ("SIMPLE_FISHEYE", 3),
     15: ("FISHEYE", 4),
+    16: ("EUCM", None),
+    17: ("EQUIRECTANGULAR", None),
 }
-# Models that OpenCV does not have, named only to be refused clearly.
-OTHER_MODELS = {
-    7: "FOV",
-    10: "THIN_PRISM_FISHEYE",
-    11: "RAD_TAN_THIN_PRISM_FISHEYE",
-    12: "SIMPLE_DIVISION",
-    13: "DIVISION",
-    16: "EUCM",
-    17: "EQUIRECTANGULAR",
-}
+POINT = np.dtype([("id", "<i8"), ("position", "<f8", 3), ("colour", "u1", 3)])
+OBSERVATION = np.dtype([("pixel", "<f8", 2), ("point", "<i8")])
+TRACK_ELEMENT = np.dtype([("image", "<u4"), ("observation", "<u4")])
 
 
 @dataclass(frozen=True)
@@ -105,38 +101,37 @@ class ColmapImage:
 
 
 class ColmapModel(NamedTuple):
-    """The three files of a model; points are (ids (N,), positions (N, 3), colours (N, 3)), or None."""
+    """The three files of a model; points are an array of `POINT`, each id once, or None."""
 
     cameras: dict[int, ColmapCamera]
     images: list[ColmapImage]
-    points: tuple[np.ndarray, np.ndarray, np.ndarray] | None
+    points: np.ndarray | None
 
 
-def refuse_model(model: int | str, path: Path) -> DataError:
-    """The error for a camera model that cannot be straightened here."""
-    name = OTHER_MODELS.get(model, model) if isinstance(model, int) else model[:40]
-    if name in OTHER_MODELS.values():
-        reason = f"camera model {name} is none of OpenCV's; undistort first (colmap image_undistorter)"
-    else:
-        known = ", ".join(known for known, _ in CAMERA_MODELS.values())
-        reason = f"unknown camera model {name!r}; expected one of {known}"
-    return DataError(path, reason)
+def read_model(folder: Path, form: str) -> ColmapModel:
+    """Read ``cameras``, ``images`` and, where it exists, ``points3D``.
 
-
-def check_model(cameras: dict[int, ColmapCamera], images: list[ColmapImage], folder: Path, form: str) -> None:
-    """Check the values of cameras and photographs.
+    Args:
+        folder: where they lie.
+        form: "bin" or "txt".
 
     Raises:
-        DataError: sizes, focal lengths, rotations or observations make no sense, or an id is used twice.
+        DataError: a file is damaged or too large, an id is used twice, or sizes, focal lengths, rotations, observations
+            or points make no sense.
     """
+    read_cameras, read_images, read_points = READERS[form]
     path = folder / f"cameras.{form}"
-    for camera_id, camera in cameras.items():
-        numbers = np.array(camera.parameters)
+    cameras: dict[int, ColmapCamera] = {}
+    for camera_id, camera in read_cameras(path):
+        if camera_id in cameras:
+            raise DataError(path, f"uses camera id {camera_id} twice")
         if not (0 < camera.width <= 1 << 17 and 0 < camera.height <= 1 << 17):
             raise DataError(path, f"camera {camera_id} has an impossible size {camera.width} x {camera.height}")
-        if not (np.abs(numbers) < 1e7).all() or min(camera.focal_lengths) <= 0:
+        if not (np.abs(camera.parameters) < 1e7).all() or min(camera.focal_lengths) <= 0:
             raise DataError(path, f"camera {camera_id}: parameters must be finite and focal lengths positive")
+        cameras[camera_id] = camera
     path = folder / f"images.{form}"
+    images = list(read_images(path))
     if len({image.image_id for image in images}) != len(images):
         raise DataError(path, "uses a photograph's id twice")
     for image in images:
@@ -147,15 +142,160 @@ def check_model(cameras: dict[int, ColmapCamera], images: list[ColmapImage], fol
             raise DataError(path, f"{image.name[:80]!r}: the translation is not finite or beyond 1e12")
         if not np.isfinite(image.pixels).all():
             raise DataError(path, f"{image.name[:80]!r}: an observation is not finite")
-
-
-def check_points(identifiers: np.ndarray, positions: np.ndarray, path: Path) -> None:
-    """Check sparse points.
-
-    Raises:
-        DataError: an id is used twice or a position is not finite.
-    """
-    if len(np.unique(identifiers)) != len(identifiers):
+    path = folder / f"points3D.{form}"
+    if not path.is_file():
+        return ColmapModel(cameras, images, None)
+    points = np.fromiter(read_points(path), POINT)
+    if len(np.unique(points["id"])) != len(points):
         raise DataError(path, "uses a point's id twice")
-    if not (np.abs(positions) < 1e12).all():
+    if not (np.abs(points["position"]) < 1e12).all():
         raise DataError(path, "a point is not finite or beyond 1e12")
+    return ColmapModel(cameras, images, points)
+
+
+def _find_model(model: int | str, path: Path) -> tuple[str, int]:
+    """The name and the number of parameters of a camera model, given by its id or its name."""
+    for number, (name, parameters) in CAMERA_MODELS.items():
+        if model in (number, name):
+            if parameters is None:
+                reason = f"camera model {name} is none of OpenCV's; undistort first (colmap image_undistorter)"
+                raise DataError(path, reason)
+            return name, parameters
+    known = ", ".join(name for name, parameters in CAMERA_MODELS.values() if parameters is not None)
+    raise DataError(path, f"unknown camera model {str(model)[:40]!r}; expected one of {known}")
+
+
+class _Cursor:
+    """A position in a file's bytes that refuses to run past their end."""
+
+    def __init__(self, path: Path, limit: int):
+        self.path = path
+        self.content = read_bytes(path, limit)
+        self.offset = 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        """The next values in a layout of `struct`."""
+        size = struct.calcsize(layout)
+        if self.offset + size > len(self.content):
+            raise DataError(self.path, f"ends inside a record at byte {self.offset}")
+        self.offset += size
+        return struct.unpack_from(layout, self.content, self.offset - size)
+
+    def count(self, least: int) -> int:
+        """A count of records of at least ``least`` bytes each, refused where the file is too short for them."""
+        (number,) = self.take("<Q")
+        if number * least > len(self.content) - self.offset:
+            raise DataError(self.path, f"announces {number} records at byte {self.offset - 8}, more than it can hold")
+        return int(number)
+
+    def array(self, dtype: np.dtype) -> np.ndarray:
+        """The items that come after their count."""
+        values = np.frombuffer(self.content, dtype, self.count(dtype.itemsize), self.offset)
+        self.offset += values.nbytes
+        return values
+
+    def text(self) -> str:
+        """A zero-terminated UTF-8 name."""
+        end = self.content.find(b"\0", self.offset, self.offset + 513)
+        if end < 0:
+            raise DataError(self.path, f"holds a name without end at byte {self.offset}")
+        try:
+            name = self.content[self.offset : end].decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise DataError(self.path, f"holds a name that is not text at byte {self.offset}") from error
+        self.offset = end + 1
+        return name
+
+    def records(self, least: int) -> Iterator[int]:
+        """Count as many records as the file announces, and refuse what comes after the last."""
+        yield from range(self.count(least))
+        if self.offset != len(self.content):
+            raise DataError(self.path, f"holds {len(self.content) - self.offset} bytes after its last record")
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
+    cursor = _Cursor(path, MAX_CAMERA_BYTES)
+    for _ in cursor.records(24 + 24):
+        camera_id, model, width, height = cursor.take("<IiQQ")
+        name, number = _find_model(model, path)
+        yield camera_id, ColmapCamera(name, width, height, cursor.take(f"<{number}d"))
+
+
+def _binary_images(path: Path) -> Iterator[ColmapImage]:
+    cursor = _Cursor(path, MAX_MODEL_BYTES)
+    for _ in cursor.records(64 + 1 + 8):
+        image_id, *pose, camera_id = cursor.take("<I7dI")
+        name, seen = cursor.text(), cursor.array(OBSERVATION)
+        yield ColmapImage(
+            image_id, camera_id, name, np.array(pose[:4]), np.array(pose[4:]), seen["pixel"], seen["point"]
+        )
+
+
+def _binary_points(path: Path) -> Iterator[tuple[int, tuple[float, ...], tuple[int, ...]]]:
+    cursor = _Cursor(path, MAX_MODEL_BYTES)
+    for _ in cursor.records(43 + 8):
+        point_id, *values, _ = cursor.take("<q3d3Bd")
+        # The track repeats what the photographs' own observations say; it is stepped over, here and in the text.
+        cursor.array(TRACK_ELEMENT)
+        yield point_id, tuple(values[:3]), tuple(values[3:])
+
+
+def _numbered_lines(path: Path, limit: int) -> list[tuple[str, str]]:
+    lines = read_text(path, limit).split("\n")
+    return [(f"line {number}", line) for number, line in enumerate(lines, 1) if not line.lstrip().startswith("#")]
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
+    for where, line in _numbered_lines(path, MAX_CAMERA_BYTES):
+        tokens = line.split()
+        if not tokens:
+            continue
+        if len(tokens) < 4:
+            raise DataError(path, f"{where}: expected id, model, width, height and parameters")
+        name, number = _find_model(tokens[1], path)
+        if len(tokens) - 4 != number:
+            raise DataError(path, f"{where}: {name} has {number} parameters; got {len(tokens) - 4}")
+        camera_id, width, height = parse_ints([tokens[0], *tokens[2:4]], path, where)
+        yield camera_id, ColmapCamera(name, width, height, tuple(parse_floats(tokens[4:], path, where)))
+
+
+def _text_images(path: Path) -> Iterator[ColmapImage]:
+    lines = _numbered_lines(path, MAX_TEXT_BYTES)
+    # A photograph takes two lines, and the second is empty where it observes nothing: only blank lines before the
+    # first record and after the last may be dropped.
+    while lines and not lines[0][1].strip():
+        lines.pop(0)
+    while lines and not lines[-1][1].strip():
+        lines.pop()
+    if len(lines) % 2:
+        lines.append((lines[-1][0], ""))
+    for (where, line), (where_seen, seen_line) in zip(lines[0::2], lines[1::2], strict=True):
+        tokens, seen = line.split(maxsplit=9), seen_line.split()
+        if len(tokens) != 10:
+            raise DataError(path, f"{where}: expected id, quaternion, translation, camera id and name")
+        if len(seen) % 3:
+            raise DataError(path, f"{where_seen}: observations must come as x, y, point id")
+        image_id, camera_id = parse_ints([tokens[0], tokens[8]], path, where)
+        pose = np.array(parse_floats(tokens[1:8], path, where))
+        pixels = np.array(parse_floats([*seen[0::3], *seen[1::3]], path, where_seen)).reshape(2, -1).T
+        points = np.array(parse_ints(seen[2::3], path, where_seen), np.int64)
+        yield ColmapImage(image_id, camera_id, tokens[9].strip(), pose[:4], pose[4:], pixels, points)
+
+
+def _text_points(path: Path) -> Iterator[tuple[int, tuple[float, ...], tuple[int, ...]]]:
+    for where, line in _numbered_lines(path, MAX_TEXT_BYTES):
+        tokens = line.split(maxsplit=8)
+        if not tokens:
+            continue
+        if len(tokens) < 8:
+            raise DataError(path, f"{where}: expected id, position, colour and error")
+        point_id, *colour = parse_ints([tokens[0], *tokens[4:7]], path, where)
+        if not all(0 <= value <= 255 for value in colour):
+            raise DataError(path, f"{where}: colours must lie in 0..255")
+        yield point_id, tuple(parse_floats(tokens[1:4], path, where)), tuple(colour)
+
+
+READERS = {
+    "bin": (_binary_cameras, _binary_images, _binary_points),
+    "txt": (_text_cameras, _text_images, _text_points),
+}

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lsmgeo.data.files import MAX_PIXELS, image_size, read_bytes
-from lsmgeo.data.png import DEPTH, decode_png
+from lsmgeo.data.files import read_bytes
+from lsmgeo.data.images import DEPTH, MAX_PIXELS, decode_png, image_size
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:

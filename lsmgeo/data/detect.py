@@ -10,9 +10,11 @@ from lsmgeo.data.binvox import is_binvox, read_binvox
 from lsmgeo.data.calibration import is_calibration, read_calibration
 from lsmgeo.data.cameras_json import is_cameras_json, read_cameras_json
 from lsmgeo.data.colmap import model_folder, read_colmap
+from lsmgeo.data.files import refuse_unreadable
+from lsmgeo.data.images import SUFFIXES
 from lsmgeo.data.llff import is_llff, read_llff
 from lsmgeo.data.lsm_release import is_lsm, read_lsm
-from lsmgeo.data.middlebury import parameter_files, read_middlebury
+from lsmgeo.data.middlebury import is_middlebury, read_middlebury
 from lsmgeo.data.posed import PosedImages
 from lsmgeo.data.r2n2 import is_r2n2, read_r2n2
 from lsmgeo.data.rgbd import is_rgbd, read_rgbd
@@ -28,7 +30,6 @@ if TYPE_CHECKING:
 __all__ = ["FORMATS", "Format", "detect", "open_scene"]
 
 
-PICTURES = (".png", ".jpg", ".jpeg")
 MOST_LOOKED_AT = 1000
 # What lies in an object of the LSM release, and in one of 3D-R2N2's, below the folder of many.
 TREES = (
@@ -59,10 +60,6 @@ class Format(NamedTuple):
     read: Callable[[Path], Any]
 
 
-def _is_middlebury(path: Path) -> bool:
-    return path.name.endswith("_par.txt") if path.is_file() else bool(parameter_files(path))
-
-
 def _is_colmap(path: Path) -> bool:
     return path.is_dir() and model_folder(path) is not None
 
@@ -73,7 +70,7 @@ def _is_solid(path: Path) -> bool:
 
 
 FORMATS = (
-    Format("middlebury", "photographs", "a Middlebury *_par.txt", _is_middlebury, read_middlebury),
+    Format("middlebury", "photographs", "a Middlebury *_par.txt", is_middlebury, read_middlebury),
     Format("colmap", "photographs", "a COLMAP model (cameras and images, .bin or .txt)", _is_colmap, read_colmap),
     Format("rgbd", "photographs", "K.txt, poses.txt and frame_index.txt of an RGB-D set", is_rgbd, read_rgbd),
     Format("7-scenes", "photographs", "frame-*.pose.txt of 7-Scenes", is_seven_scenes, read_seven_scenes),
@@ -89,6 +86,7 @@ FORMATS = (
 )
 
 
+@refuse_unreadable
 def detect(path: str | Path) -> Format:
     """Tell the format from what a folder holds, or from a file.
 
@@ -96,14 +94,9 @@ def detect(path: str | Path) -> Format:
         DataError: there is no such path, or it is of no known format or of several.
     """
     path = Path(path)
-    try:
-        if not path.is_file() and not path.is_dir():
-            raise DataError(path, "no such file or folder")
-        found = [candidate for candidate in FORMATS if candidate.is_here(path)]
-    except (OSError, ValueError) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(path, f"cannot be read ({error})") from error
+    if not path.is_file() and not path.is_dir():
+        raise DataError(path, "no such file or folder")
+    found = [candidate for candidate in FORMATS if candidate.is_here(path)]
     if len(found) > 1:
         several = " and ".join(candidate.needs for candidate in found)
         raise DataError(path, f"holds {several}; name the one file or folder that is meant")
@@ -116,7 +109,7 @@ def _why_nothing(path: Path) -> str:
     """What is said of a path in which no format is found: the likely slip first."""
     pictures, others = [], False
     for item in islice(path.iterdir(), MOST_LOOKED_AT) if path.is_dir() else [path]:
-        if item.suffix.lower() in PICTURES:
+        if item.suffix.lower() in SUFFIXES:
             pictures.append(item)
         others = others or item not in pictures
     if path.is_file() and pictures:

@@ -1,4 +1,4 @@
-"""Reading files that nobody vouches for, and writing files that are never half there.
+"""Reading files that nobody vouches for, and writing files and folders that are never half there.
 
 Everything that comes from outside is hostile until checked: sizes are compared with the file before anything is
 allocated, names stay inside their folder, and every failure is a :class:`lsmgeo.errors.DataError` that names the file.
@@ -7,12 +7,14 @@ allocated, names stay inside their folder, and every failure is a :class:`lsmgeo
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
-import tempfile
-import warnings
+import re
+import secrets
+import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -21,48 +23,58 @@ from lsmgeo.errors import DataError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from PIL import Image
-
 __all__ = [
-    "MAX_PIXELS",
     "AtomicFile",
     "atomic_file",
+    "atomic_folder",
     "child",
-    "has_alpha",
-    "image_size",
+    "clear_leftovers",
+    "one_file",
     "parse_floats",
     "parse_ints",
+    "plain_files",
     "read_bytes",
-    "read_cut_out",
-    "read_image",
     "read_text",
     "refuse_unreadable",
+    "refusing",
+    "remove_folder",
     "write_atomic",
     "write_point_cloud",
 ]
 
-# Room for the 24 and 61 megapixels of today's cameras, below the size at which Pillow itself suspects a bomb.
-MAX_PIXELS = 1 << 26
 MAX_TEXT_BYTES = 1 << 28
 MAX_NUMBER_LENGTH = 64
+# What a killed process leaves behind: on its way in, also as earlier versions called it, or on its way out.
+_LEFTOVER = re.compile(r"\..+\.tmp|.+\.tmp-\d+|(?P<name>.+)\.old-\d+")
 
 
 Options = ParamSpec("Options")
 Content = TypeVar("Content")
 
 
+@contextlib.contextmanager
+def refusing(path: str | os.PathLike[str], what: str = "written") -> Iterator[None]:
+    """Make what the system says in a block (no permission, a full disk, a name too long) a `DataError`.
+
+    Args:
+        path: the file or folder that is meant.
+        what: what cannot be done with it.
+    """
+    try:
+        yield
+    except DataError:
+        raise
+    except OSError as error:
+        raise DataError(path, f"cannot be {what} ({str(error)[:400]})") from error
+
+
 def refuse_unreadable(read: Callable[Options, Content]) -> Callable[Options, Content]:
-    """Make what the system says while a reader looks around (no permission, a name too long) a `DataError`."""
+    """Make what the system says while a reader looks around a `DataError` of the path, its first argument."""
 
     @functools.wraps(read)
     def refusing(*args: Options.args, **options: Options.kwargs) -> Content:
-        try:
+        with refusing(args[0] if args else options["path"], "read"):
             return read(*args, **options)
-        except DataError:
-            raise
-        except OSError as error:
-            path = args[0] if args else options["path"]
-            raise DataError(str(path), f"cannot be read ({str(error)[:400]})") from error
 
     return refusing
 
@@ -73,16 +85,12 @@ def read_bytes(path: Path, limit: int) -> bytes:
     Raises:
         DataError: the file is missing, not a plain file, unreadable, or larger than ``limit``.
     """
-    try:
+    with refusing(path, "read"):
         # A pipe or a device would block or never end, so only plain files are opened at all.
         if not path.is_file():
             raise DataError(path, "no such file")
         with path.open("rb") as stream:
             content = stream.read(limit + 1)
-    except DataError:
-        raise
-    except (OSError, ValueError) as error:
-        raise DataError(path, f"cannot be read ({error})") from error
     if len(content) > limit:
         raise DataError(path, f"is larger than the limit of {limit} bytes")
     return content
@@ -127,8 +135,27 @@ def child(root: Path, name: str, source: Path) -> Path:
     return path
 
 
-def parse_floats(tokens: Sequence[str], path: Path, where: str) -> list[float]:
-    """Finite numbers from text.
+def plain_files(folder: Path, *patterns: str) -> list[Path]:
+    """The plain files of a folder, sorted, that match the first of the patterns that any matches."""
+    found = (sorted(path for path in folder.glob(pattern) if path.is_file()) for pattern in patterns)
+    return next(filter(None, found), [])
+
+
+def one_file(path: Path, *patterns: str) -> Path:
+    """The path itself where it is no folder, else the one file in it, see `plain_files`.
+
+    Raises:
+        DataError: the folder holds none, or several.
+    """
+    files = plain_files(path, *patterns) if path.is_dir() else [path]
+    if len(files) != 1:
+        found = ", ".join(file.name for file in files[:5]) or "none"
+        raise DataError(path, f"expected one file {' or '.join(patterns)}; found {found}: name the one meant")
+    return files[0]
+
+
+def parse_floats(tokens: Sequence[str], path: Path, where: str, *, finite: bool = True) -> list[float]:
+    """Numbers from text, finite ones unless others are asked for.
 
     Raises:
         DataError: a token is not a number, is not finite or is absurdly long.
@@ -139,7 +166,7 @@ def parse_floats(tokens: Sequence[str], path: Path, where: str) -> list[float]:
         values = [float(token) for token in tokens]
     except ValueError as error:
         raise DataError(path, f"{where}: expected numbers ({error})") from error
-    if not np.isfinite(values).all():
+    if finite and not np.isfinite(values).all():
         raise DataError(path, f"{where}: numbers must be finite")
     return values
 
@@ -161,123 +188,27 @@ def parse_ints(tokens: Sequence[str], path: Path, where: str) -> list[int]:
     return values
 
 
-def image_size(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[int, int]:
-    """The (height, width) that a PNG or JPEG states in its header; no pixel is decoded.
-
-    Raises:
-        DataError: not a PNG or JPEG, or more than ``max_pixels``.
-    """
-    with _open_image(path, max_pixels) as image:
-        return image.size[1], image.size[0]
-
-
-def has_alpha(path: Path) -> bool:
-    """Whether a PNG or JPEG says in its header that it has transparent pixels; none is decoded.
-
-    Raises:
-        DataError: as `image_size`.
-    """
-    with _open_image(path, MAX_PIXELS) as image:
-        return image.mode in ("RGBA", "LA") or "transparency" in image.info
-
-
-def read_image(path: Path, size: tuple[int, int] | None = None, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Read a PNG or JPEG photograph as 8-bit RGB.
-
-    The pixels come as they are stored: an orientation that EXIF states is not applied, as COLMAP and instant-ngp do not
-    apply it.
-
-    Args:
-        path: the image file.
-        size: expected (height, width); checked before a pixel is decoded.
-        max_pixels: largest number of pixels accepted.
-
-    Returns:
-        (H, W, 3) uint8.
-
-    Raises:
-        DataError: not a PNG or JPEG, another size than expected, too large, or damaged.
-    """
-    with _open_image(path, max_pixels) as image:
-        _refuse_size(image, size, path)
-        _refuse_deep(image, path)
-        return np.array(image.convert("RGB"))
-
-
-def read_cut_out(path: Path, size: tuple[int, int] | None = None, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Read a PNG or JPEG as 8-bit RGBA, alpha 255 where it has none; otherwise as `read_image`.
-
-    Returns:
-        (H, W, 4) uint8, not premultiplied.
-    """
-    with _open_image(path, max_pixels) as image:
-        _refuse_size(image, size, path)
-        _refuse_deep(image, path)
-        return np.array(image.convert("RGBA"))
-
-
-def _refuse_size(image: Image.Image, size: tuple[int, int] | None, path: Path) -> None:
-    width, height = image.size
-    if size is not None and (height, width) != tuple(size):
-        reason = f"is {width} x {height} pixels (width x height); its camera expects {size[1]} x {size[0]}"
-        raise DataError(path, reason)
-
-
-def _refuse_deep(image: Image.Image, path: Path) -> None:
-    if image.mode not in ("1", "L", "LA", "P", "RGB", "RGBA", "CMYK"):
-        raise DataError(path, f"has mode {image.mode}; expected an 8-bit picture")
-
-
-@contextlib.contextmanager
-def _open_image(path: Path, max_pixels: int) -> Iterator[Image.Image]:
-    from PIL import Image
-
-    limit = 4096 + 8 * max_pixels
-    try:
-        # A pipe or a device would block or never end, so only plain files are opened at all.
-        if not path.is_file():
-            raise DataError(path, "no such file")
-        if path.stat().st_size > limit:
-            raise DataError(path, f"is larger than the limit of {limit} bytes")
-        with warnings.catch_warnings():
-            # Pillow warns of palettes and of second pictures in a JPEG, which are read as they should be.
-            warnings.simplefilter("ignore")
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            # Sniffing among all of Pillow's formats would reach parsers (EPS, FITS) that run programs or expand files.
-            # The file itself, not its bytes: of hundreds of photographs only the headers are read when a scene opens.
-            with path.open("rb") as stream, Image.open(stream, formats=("PNG", "JPEG")) as image:
-                width, height = image.size
-                if width * height > max_pixels:
-                    raise DataError(path, f"has {width} x {height} pixels, the limit is {max_pixels}")
-                yield image
-    except DataError:
-        raise
-    # Pillow's decoders raise OSError, SyntaxError, ValueError, struct.error, zlib.error and more on damaged files.
-    except Exception as error:
-        raise DataError(path, f"is not a readable PNG or JPEG picture ({error})") from error
-
-
 class AtomicFile:
     """A file being written by `atomic_file`: bytes go in, and only whole does it take its place."""
 
-    def __init__(self, path: Path, stream: BinaryIO) -> None:
+    def __init__(self, path: Path, descriptor: int) -> None:
         self.path = path
-        self._stream = stream
+        self._descriptor = descriptor
 
-    def write(self, content: bytes) -> int:
+    def write(self, content: bytes) -> None:
         """Append bytes.
 
         Raises:
             DataError: the disk is full, and the like.
         """
-        try:
-            return self._stream.write(content)
-        except OSError as error:
-            raise DataError(self.path, f"cannot be written ({error})") from error
+        rest = memoryview(content)
+        with refusing(self.path):
+            while rest:
+                rest = rest[os.write(self._descriptor, rest) :]
 
     def fileno(self) -> int:
         """The descriptor of the temporary file."""
-        return self._stream.fileno()
+        return self._descriptor
 
 
 @contextlib.contextmanager
@@ -297,45 +228,21 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[AtomicFile]:
         DataError: the folder or the file cannot be written. Errors of the block itself pass unchanged.
     """
     path = Path(path)
-    temporary = stream = None
+    temporary, descriptor = _beside(path), -1
     try:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-            temporary = Path(name)
-            stream = os.fdopen(descriptor, "wb")
-        except OSError as error:
-            raise DataError(path, f"cannot be written ({error})") from error
-        yield AtomicFile(path, stream)
-        try:
-            stream.flush()
-            os.fsync(stream.fileno())
-            stream.close()
-            # mkstemp makes a private file; a result should have the permissions that the user's umask gives.
-            umask = os.umask(0)
-            os.umask(umask)
-            temporary.chmod(0o666 & ~umask)
-            temporary.replace(path)
-            temporary = None
-            _sync_folder(path.parent)
-        except OSError as error:
-            raise DataError(path, f"cannot be written ({error})") from error
-    finally:
-        if stream is not None:
-            with contextlib.suppress(OSError):  # a full disk refuses the rest once more
-                stream.close()
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Bring a folder's entries to the disk, where the system can: a rename is not kept before that."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
+        with refusing(path):
+            _make_folder(path.parent)
+            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
+        yield AtomicFile(path, descriptor)
+        with refusing(path):
             os.fsync(descriptor)
-        finally:
+            temporary.replace(path)
+            _sync_folder(path.parent)
+    finally:
+        if descriptor >= 0:
             os.close(descriptor)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
 
 
 def write_atomic(path: str | os.PathLike[str], content: bytes) -> Path:
@@ -347,6 +254,116 @@ def write_atomic(path: str | os.PathLike[str], content: bytes) -> Path:
     with atomic_file(path) as stream:
         stream.write(content)
     return Path(path)
+
+
+@contextlib.contextmanager
+def atomic_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Iterator[Path]:
+    """Fill a folder so that it is either wholly there or not at all.
+
+    What the block writes goes to a temporary folder beside the target, which takes the target's name when the block
+    ends. If the block raises, nothing of it stays.
+
+    Args:
+        path: the folder to make. Parents are created.
+        replace: whether the folder may be there already. It is then renamed out of the way first: a kill between the
+            two steps leaves it as ``NAME.old-PID``, which `clear_leftovers` brings back. Otherwise the target must not
+            exist, or be empty.
+
+    Yields:
+        The temporary folder; files in it are best written by `write_atomic`, which brings them to the disk.
+
+    Raises:
+        DataError: something is there already, or the folder cannot be written. Errors of the block pass unchanged.
+    """
+    path = Path(path)
+    temporary = _beside(path)
+    try:
+        with refusing(path):
+            if not replace and (path.is_symlink() or (path.exists() and (not path.is_dir() or any(path.iterdir())))):
+                raise DataError(path, "is there already and not an empty folder; name a new one")
+            if path.resolve() == Path.cwd():
+                raise DataError(path, "is the current folder, which cannot be replaced; name a new one")
+            _make_folder(path.parent)
+            temporary.mkdir()
+        yield temporary
+        with refusing(path):
+            _take_place(temporary, path)
+            _sync_folder(path.parent)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder so that a kill in the middle leaves all of it, or nothing but a leftover.
+
+    Raises:
+        DataError: it cannot be removed.
+    """
+    leftover = _beside(folder)
+    with refusing(folder, "removed"):
+        folder.replace(leftover)
+        shutil.rmtree(leftover)
+
+
+def clear_leftovers(folder: Path) -> None:
+    """Remove what a killed process left behind. Only who alone writes into the folder may do this.
+
+    Args:
+        folder: it need not exist.
+
+    Raises:
+        DataError: the folder cannot be read, or a file not removed.
+    """
+    with refusing(folder):
+        for item in sorted(folder.iterdir()) if folder.is_dir() else ():
+            match = _LEFTOVER.fullmatch(item.name)
+            if match is None:
+                continue
+            if match["name"] and not (folder / match["name"]).exists():
+                item.replace(folder / match["name"])
+            elif item.is_dir():
+                shutil.rmtree(item)
+            else:
+                item.unlink(missing_ok=True)
+
+
+def _beside(path: Path) -> Path:
+    """A name in the same folder that nobody has: hidden, and known to `clear_leftovers`."""
+    return path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp"
+
+
+def _make_folder(folder: Path) -> None:
+    if not folder.is_dir():
+        folder.mkdir(parents=True, exist_ok=True)
+        _sync_folder(folder.parent)
+
+
+def _take_place(temporary: Path, path: Path) -> None:
+    # A folder cannot replace a full one in one step. Readers of checkpoints know the old one by its new name too.
+    old = path.with_name(f"{path.name}.old-{os.getpid()}")
+    is_there = path.exists()
+    if is_there:
+        path.replace(old)
+    try:
+        temporary.replace(path)
+    except OSError:
+        if is_there:
+            old.replace(path)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Bring a folder's entries to the disk, where the system can: a rename is not kept before that."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EACCES, errno.EINVAL, errno.ENOTSUP):
+            raise
 
 
 def write_point_cloud(path: str | os.PathLike[str], positions: np.ndarray, colours: np.ndarray) -> Path:

@@ -6,11 +6,10 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from lsmgeo.cameras import from_opencv
-from lsmgeo.data.assembling import MAX_PARAMETER, MAX_SIDE, as_data_error, assemble, check_rotation
-from lsmgeo.data.files import child, has_alpha, image_size, refuse_unreadable
+from lsmgeo.data.assembling import MAX_PARAMETER, MAX_SIDE, assemble, check_rotation, make_cameras
+from lsmgeo.data.files import child, refuse_unreadable
+from lsmgeo.data.images import SUFFIXES, has_alpha, image_size
 from lsmgeo.data.posed import PosedImages
 from lsmgeo.errors import DataError
 
@@ -19,7 +18,6 @@ __all__ = ["is_llff", "read_llff"]
 NAME = "poses_bounds.npy"
 COLUMNS = 17
 MAX_BYTES = 1 << 24
-SUFFIXES = (".png", ".jpg", ".jpeg")
 REDUCED = ("images_2", "images_4", "images_8")
 
 
@@ -86,16 +84,7 @@ def read_llff(path: str | Path) -> PosedImages:
         intrinsics[view] = _intrinsics(matrices[view, :, 4], sizes[-1], file, f"{where} ({picture.name!r})")
     R = world_from_cam.transpose(0, 2, 1)
     t = -(R @ matrices[:, :, 3:4])[..., 0]
-    height, width = torch.tensor(sizes).unbind(-1)
-    with as_data_error(file):
-        cameras = from_opencv(
-            torch.from_numpy(intrinsics),
-            torch.from_numpy(R.copy()),
-            torch.from_numpy(t),
-            height,
-            width,
-            pixel_center="half",
-        )
+    cameras = make_cameras(intrinsics, R, t, sizes, file, pixel_center="half")
     names = [picture.name for picture in paths]
     return assemble(names, paths, cameras, "llff", file=file, cut_out=any(map(has_alpha, paths)))
 

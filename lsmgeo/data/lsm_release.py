@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -11,10 +12,10 @@ import numpy as np
 import torch
 
 from lsmgeo._checks import check_choice
-from lsmgeo.cameras import from_opencv
-from lsmgeo.data.assembling import as_data_error, check_intrinsics, check_rotation
+from lsmgeo.data.assembling import assemble, check_intrinsics, check_last_row, check_rotation, make_cameras
 from lsmgeo.data.depth_files import DepthPng
-from lsmgeo.data.files import child, image_size, refuse_unreadable
+from lsmgeo.data.files import child, refuse_unreadable
+from lsmgeo.data.images import image_size
 from lsmgeo.data.isolated import isolated
 from lsmgeo.data.mat_files import parse_mat
 from lsmgeo.data.metadata import MAX_VIEWS
@@ -92,13 +93,7 @@ def read_lsm(path: str | Path, *, voxels: int = 32) -> PosedImages:
     if isinstance(found, DataError):
         raise found
     scene, grids = found
-    return scene if not grids else _with_voxels(scene, grids[0])
-
-
-def _with_voxels(scene: PosedImages, grid: torch.Tensor) -> PosedImages:
-    from dataclasses import replace
-
-    return replace(scene, voxels=Voxels(grid, VoxelGrid(len(grid))))
+    return scene if not grids else replace(scene, voxels=Voxels(grids[0], VoxelGrid(len(grids[0]))))
 
 
 def find_lsm(folder: Path, resolutions: Sequence[int]) -> LsmObject:
@@ -180,26 +175,20 @@ def _scene(found: LsmObject, cameras: list[Arrays]) -> PosedImages:
         intrinsics, extrinsic = arrays["K"], arrays["extrinsic"]
         check_intrinsics(intrinsics, file, "K")
         check_rotation(extrinsic[:3, :3], file, "extrinsic")
-        if np.abs(extrinsic[3] - (0, 0, 0, 1)).max() > 1e-6:
-            raise DataError(file, "extrinsic must have the last row 0 0 0 1")
+        check_last_row(extrinsic, file, "extrinsic")
         K.append(intrinsics)
         E.append(extrinsic)
         sizes.append(image_size(picture))
         depth = child(found.folder, f"depth_{view}.png", found.folder)
         depths.append(DepthPng(depth, DEPTH_STEP, (NO_DEPTH,)) if depth.exists() else None)
-    poses = torch.from_numpy(np.array(E))
-    height, width = torch.tensor(sizes).unbind(-1)
-    with as_data_error(found.folder):
-        made = from_opencv(
-            torch.from_numpy(np.array(K)), poses[:, :3, :3], poses[:, :3, 3], height, width, pixel_center="half"
-        )
-    return PosedImages(
-        tuple(path.name for path in paths),
-        tuple(paths),
-        made,
-        None,
+    poses = np.array(E)
+    return assemble(
+        [path.name for path in paths],
+        paths,
+        make_cameras(K, poses[:, :3, :3], poses[:, :3, 3], sizes, found.folder, pixel_center="half"),
         "lsm",
-        depths=tuple(depths) if any(depths) else None,
+        file=found.folder,
+        depths=depths,
         cut_out=True,
         category=spell_synset(found.folder.resolve().parent.name),
     )

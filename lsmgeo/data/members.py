@@ -23,8 +23,8 @@ from torch import Tensor
 
 from lsmgeo._checks import check_number, describe
 from lsmgeo.cameras.tensors import check_cameras
+from lsmgeo.data.images import DEPTH, RGBA, decode_png, encode_png
 from lsmgeo.data.metadata import MAX_SIDE, MAX_VIEWS, MAX_VOXELS, is_text
-from lsmgeo.data.png import DEPTH, RGBA, decode_png, encode_png
 from lsmgeo.data.sample import Sample, check_sample
 from lsmgeo.errors import DataError, DTypeError, OptionError, ShapeError
 

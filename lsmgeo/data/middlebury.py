@@ -6,24 +6,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
-from lsmgeo.cameras import from_opencv
-from lsmgeo.data.assembling import as_data_error, assemble, check_intrinsics, check_rotation
-from lsmgeo.data.files import child, image_size, parse_floats, parse_ints, read_text, refuse_unreadable
+from lsmgeo.data.assembling import assemble, check_intrinsics, check_rotation, make_cameras
+from lsmgeo.data.files import child, one_file, parse_floats, parse_ints, plain_files, read_text, refuse_unreadable
+from lsmgeo.data.images import image_size
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
     from lsmgeo.data.posed import PosedImages
 
-__all__ = ["parameter_files", "read_middlebury"]
+__all__ = ["is_middlebury", "read_middlebury"]
 
+PARAMETERS = "*_par.txt"
 MAX_PARAMETER_BYTES = 1 << 24
 
 
-def parameter_files(folder: Path) -> list[Path]:
-    """The ``*_par.txt`` files of a folder, sorted."""
-    return sorted(path for path in folder.glob("*_par.txt") if path.is_file())
+def is_middlebury(path: Path) -> bool:
+    """Whether a folder holds a file of parameters, or a file is one by its name."""
+    return path.match(PARAMETERS) if path.is_file() else bool(plain_files(path, PARAMETERS))
 
 
 @refuse_unreadable
@@ -46,12 +46,7 @@ def read_middlebury(path: str | Path) -> PosedImages:
     Raises:
         DataError: a file is missing, damaged, too large, names a file outside the folder, or holds no camera.
     """
-    path = Path(path)
-    files = parameter_files(path) if path.is_dir() else [path]
-    if len(files) != 1:
-        found = ", ".join(file.name for file in files[:5]) or "none"
-        raise DataError(path, f"expected one *_par.txt file; found {found}")
-    file = files[0]
+    file = one_file(Path(path), PARAMETERS)
     lines = [line.split() for line in read_text(file, MAX_PARAMETER_BYTES).splitlines() if line.strip()]
     if not lines or len(lines[0]) != 1:
         raise DataError(file, "the first line must be the number of photographs")
@@ -72,8 +67,6 @@ def read_middlebury(path: str | Path) -> PosedImages:
         paths.append(child(file.parent, tokens[0], file))
         # The format does not state the size, so it comes from the picture's own header.
         sizes.append(image_size(paths[-1]))
-    height, width = torch.tensor(sizes).unbind(-1)
-    K, R, t = torch.from_numpy(numbers).split((9, 9, 3), -1)
-    with as_data_error(file):
-        cameras = from_opencv(K.reshape(-1, 3, 3), R.reshape(-1, 3, 3), t, height, width)
+    K, R, t = np.split(numbers, (9, 18), -1)
+    cameras = make_cameras(K.reshape(-1, 3, 3), R.reshape(-1, 3, 3), t, sizes, file)
     return assemble(names, paths, cameras, "middlebury", file=file)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Self
 
 import torch
 
+from lsmgeo.data.files import refusing
 from lsmgeo.data.json_files import read_json
 from lsmgeo.data.lsm_release import find_lsm, read_lsm_objects
 from lsmgeo.data.metadata import MAX_SIDE, MAX_VOXELS
@@ -250,13 +251,11 @@ def open_tree(source: str | Path, splits: str | Path | None = None) -> ObjectTre
 
 def _find_lsm_folders(root: Path) -> list[str]:
     found = []
-    try:
+    with refusing(root, "read"):
         for synset in (root / "renders").iterdir():
             if synset.is_dir() and not synset.is_symlink():
                 models = (folder for folder in synset.iterdir() if folder.is_dir() and not folder.is_symlink())
                 found += [folder.relative_to(root).as_posix() for folder in models]
-    except OSError as error:
-        raise DataError(root, f"cannot be read ({error})") from error
     return found
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from lsmgeo._checks import describe
-from lsmgeo.data.files import read_cut_out, read_image
+from lsmgeo.data.images import read_cut_out, read_image
 from lsmgeo.data.sample import Sample
 from lsmgeo.errors import DataError, OptionError, ShapeError
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from lsmgeo.cameras import from_opencv
-from lsmgeo.data.assembling import as_data_error
+from lsmgeo.data.assembling import assemble, make_cameras
 from lsmgeo.data.binvox import read_binvox
-from lsmgeo.data.files import child, image_size, parse_floats, read_text, refuse_unreadable
+from lsmgeo.data.files import child, parse_floats, read_text, refuse_unreadable
+from lsmgeo.data.images import image_size
 from lsmgeo.data.lsm_release import spell_synset
 from lsmgeo.data.metadata import MAX_VIEWS
 from lsmgeo.data.posed import PosedImages
@@ -69,21 +68,19 @@ def read_r2n2(path: str | Path) -> PosedImages:
     names = _names(folder, len(lines))
     paths = [child(folder, name, folder / NAMES) for name in names]
     sizes = [image_size(picture) for picture in paths]
-    R, t = _poses(numbers)
-    height, width = torch.tensor(sizes).unbind(-1)
-    K = torch.zeros(len(lines), 3, 3, dtype=torch.float64)
+    height, width = np.array(sizes).T
+    K = np.zeros((len(lines), 3, 3))
     K[:, 0, 0] = K[:, 1, 1] = FOCAL_LENGTH_OF_WIDTH * width
     K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = width / 2, height / 2, 1
-    with as_data_error(file):
-        cameras = from_opencv(K, torch.from_numpy(R), torch.from_numpy(t), height, width, pixel_center="half")
+    cameras = make_cameras(K, *_poses(numbers), sizes, file, pixel_center="half")
     home = folder.resolve().parent
     solid = _solid(home)
-    return PosedImages(
-        tuple(names),
-        tuple(paths),
+    return assemble(
+        names,
+        paths,
         cameras,
-        None,
         "r2n2",
+        file=file,
         voxels=None if solid is None else read_binvox(solid, placement="centred"),
         cut_out=True,
         category=spell_synset(home.parent.name),

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
-from lsmgeo.cameras import from_opencv
-from lsmgeo.data.assembling import as_data_error, assemble, check_intrinsics, check_rotation
+from lsmgeo.data.assembling import assemble, check_intrinsics, check_last_row, check_rotation, make_cameras
 from lsmgeo.data.depth_files import DepthPng
-from lsmgeo.data.files import MAX_NUMBER_LENGTH, child, image_size, parse_floats, read_text, refuse_unreadable
+from lsmgeo.data.files import child, parse_floats, read_text, refuse_unreadable
+from lsmgeo.data.images import image_size
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
@@ -98,16 +97,10 @@ def parse_pose(text: str, path: Path, where: str) -> np.ndarray | None:
     tokens = text.split(maxsplit=16)
     if len(tokens) != 16:
         raise DataError(path, f"{where}: expected the 16 numbers of a pose")
-    try:
-        if any(len(token) > MAX_NUMBER_LENGTH for token in tokens):
-            raise ValueError("number too long")
-        pose = np.array([float(token) for token in tokens]).reshape(4, 4)
-    except ValueError as error:
-        raise DataError(path, f"{where}: expected numbers ({error})") from error
+    pose = np.array(parse_floats(tokens, path, where, finite=False)).reshape(4, 4)
     if not np.isfinite(pose).all():
         return None
-    if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise DataError(path, f"{where}: the last row of a pose must be 0 0 0 1")
+    check_last_row(pose, path, f"{where}: a pose")
     if np.abs(pose).max() > FARTHEST:
         raise DataError(path, f"{where}: a pose holds a number beyond {FARTHEST:g}")
     return pose
@@ -140,14 +133,11 @@ def frames_of(
         raise DataError(file, "leaves no frame: every picture is missing or its pose is not finite")
     for name, pose in zip(names, poses, strict=True):
         check_rotation(pose[:3, :3], file, name)
-    world_from_cam = torch.from_numpy(np.stack(poses))
-    R = world_from_cam[:, :3, :3].transpose(1, 2).contiguous()
+    world_from_cam = np.stack(poses)
+    R = world_from_cam[:, :3, :3].transpose(0, 2, 1)
     # -R C and not the inverse: rotations are rounded in these files, and the camera's place should not be.
     t = -(R * world_from_cam[:, None, :3, 3]).sum(-1)
-    height, width = torch.tensor([image_size(path) for path in paths]).unbind(-1)
-    K = torch.from_numpy(intrinsics).expand(len(names), 3, 3)
-    with as_data_error(file):
-        cameras = from_opencv(K, R, t, height, width)
+    cameras = make_cameras([intrinsics] * len(names), R, t, [image_size(path) for path in paths], file)
     return assemble(names, paths, cameras, source, file=file, depths=depths)
 
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from lsmgeo.cameras import to_colmap, to_opengl
+from lsmgeo.data.assembling import check_picture
 from lsmgeo.data.cameras_json import FORMAT, NAME, VERSION
-from lsmgeo.data.files import MAX_PIXELS, child, image_size, read_bytes, read_cut_out, read_image, write_atomic
-from lsmgeo.data.folders import atomic_folder
-from lsmgeo.data.png import encode_png
+from lsmgeo.data.files import atomic_folder, child, read_bytes, write_atomic
+from lsmgeo.data.images import MAX_IMAGE_BYTES, SUFFIXES, encode_png, image_size, read_cut_out, read_image
 from lsmgeo.errors import DataError, OptionError
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 __all__ = ["write_cameras_json", "write_colmap", "write_transforms"]
 
 PICTURES = "images"
-SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 def write_colmap(images: PosedImages, folder: str | PathLike[str]) -> Path:
@@ -187,13 +186,10 @@ def _file_names(images: PosedImages, *, blank: str = " ") -> list[str]:
 def _write_pictures(images: PosedImages, names: list[str], folder: Path) -> None:
     for view, name in enumerate(names):
         source, size = images.paths[view], images.size(view)
-        found = image_size(source)
-        if found != size:
-            reason = f"is {found[1]} x {found[0]} pixels (width x height); its camera expects {size[1]} x {size[0]}"
-            raise DataError(source, reason)
+        check_picture(size, image_size(source), source, source, name)
         lens = None if images.lenses is None else images.lenses[view]
         if lens is None:
-            content = read_bytes(source, 4096 + 8 * MAX_PIXELS)
+            content = read_bytes(source, MAX_IMAGE_BYTES)
         else:
             pixels = read_cut_out(source, size) if images.cut_out else read_image(source, size)
             content = encode_png(lens.straighten(pixels))

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
-from lsmgeo.cameras import from_opencv
-from lsmgeo.data.assembling import as_data_error, assemble, check_intrinsics, check_picture
+from lsmgeo.data.assembling import assemble, check_intrinsics, check_picture, make_cameras
 from lsmgeo.data.depth_files import DepthFile
-from lsmgeo.data.files import child, image_size, parse_floats, parse_ints, read_text, refuse_unreadable
+from lsmgeo.data.files import child, parse_floats, parse_ints, read_text, refuse_unreadable
+from lsmgeo.data.images import image_size
 from lsmgeo.data.pfm import read_pfm
 from lsmgeo.errors import DataError
 
@@ -112,11 +111,7 @@ def read_stereo_pair(path: str | Path) -> PosedImages:
         stated = tuple(parse_ints([entries["height"], entries["width"]], file, "height and width"))
         for picture, size in zip(paths, sizes, strict=True):
             check_picture((stated[0], stated[1]), size, picture, file, "width and height")
-    height, width = torch.tensor(sizes).unbind(-1)
-    t = torch.tensor([[0.0, 0.0, 0.0], [-baseline, 0.0, 0.0]], dtype=torch.float64)
-    with as_data_error(file):
-        K = torch.from_numpy(np.stack([first, second]))
-        cameras = from_opencv(K, torch.eye(3, dtype=torch.float64).expand(2, 3, 3), t, height, width)
+    cameras = make_cameras((first, second), [np.eye(3)] * 2, [[0, 0, 0], [-baseline, 0, 0]], sizes, file)
     depths = []
     for names in DISPARITIES:
         here = [child(folder, name, file) for name in names if (folder / name).exists()]

@@ -5,34 +5,26 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from lsmgeo.cameras import from_opencv
-from lsmgeo.data.assembling import as_data_error, assemble, check_intrinsics, check_picture, check_rotation
-from lsmgeo.data.files import child, image_size, parse_floats, read_text, refuse_unreadable
+from lsmgeo.data.assembling import assemble, check_intrinsics, check_picture, check_rotation, make_cameras
+from lsmgeo.data.files import child, parse_floats, plain_files, read_text, refuse_unreadable
+from lsmgeo.data.images import image_size
 from lsmgeo.data.posed import PosedImages
 from lsmgeo.errors import DataError
 
-__all__ = ["camera_files", "is_strecha", "read_strecha"]
+__all__ = ["is_strecha", "read_strecha"]
 
 SUFFIX = ".camera"
+# In the folder, else in the folders in it.
+PATTERNS = ("*.camera", "*/*.camera")
 MAX_CAMERA_BYTES = 1 << 16
 # Numbers of a file: K, three of radial distortion, R, the centre, width and height.
 PARTS = (9, 3, 9, 3, 2)
 
 
-def camera_files(folder: Path) -> list[Path]:
-    """The ``*.camera`` files of a folder, or of the folders in it, sorted."""
-    for pattern in (f"*{SUFFIX}", f"*/*{SUFFIX}"):
-        found = sorted(path for path in folder.glob(pattern) if path.is_file())
-        if found:
-            return found
-    return []
-
-
 def is_strecha(path: Path) -> bool:
     """Whether a folder holds such files, or a file is one by its name."""
-    return bool(camera_files(path)) if path.is_dir() else path.suffix == SUFFIX
+    return bool(plain_files(path, *PATTERNS)) if path.is_dir() else path.suffix == SUFFIX
 
 
 @refuse_unreadable
@@ -59,7 +51,7 @@ def read_strecha(path: str | Path) -> PosedImages:
             makes no sense, or is of another size than its photograph.
     """
     path = Path(path)
-    files = camera_files(path if path.is_dir() else path.parent)
+    files = plain_files(path if path.is_dir() else path.parent, *PATTERNS)
     folders = sorted({file.parent for file in files})
     if len(folders) != 1:
         found = ", ".join(folder.name for folder in folders[:5]) or "none"
@@ -85,10 +77,7 @@ def read_strecha(path: str | Path) -> PosedImages:
         check_picture((height, width), sizes[-1], paths[-1], file, "camera")
         rotations.append(rotation.reshape(3, 3).T)
         translations.append(-rotations[-1] @ center)
-    tall, wide = torch.tensor(sizes).unbind(-1)
-    K, R, t = (torch.from_numpy(np.stack(part)) for part in (intrinsics, rotations, translations))
-    with as_data_error(folders[0]):
-        cameras = from_opencv(K, R, t, tall, wide)
+    cameras = make_cameras(intrinsics, rotations, translations, sizes, folders[0])
     return assemble(names, paths, cameras, "strecha", file=folders[0])
 
 

@@ -11,17 +11,27 @@ import torch
 
 from lsmgeo._checks import describe
 from lsmgeo.cameras import from_opengl
-from lsmgeo.data.assembling import MAX_PARAMETER, MAX_SIDE, as_data_error, assemble, check_picture, check_rotation
+from lsmgeo.data.assembling import (
+    MAX_PARAMETER,
+    MAX_SIDE,
+    as_data_error,
+    assemble,
+    check_last_row,
+    check_picture,
+    check_rotation,
+)
 from lsmgeo.data.depth_files import DepthFile, DepthPng
-from lsmgeo.data.files import child, has_alpha, image_size, refuse_unreadable
+from lsmgeo.data.files import child, one_file, plain_files, refuse_unreadable
+from lsmgeo.data.images import SUFFIXES, has_alpha, image_size
 from lsmgeo.data.json_files import peek_json, read_json, take_array, take_number, take_text
 from lsmgeo.data.lenses import Lens
 from lsmgeo.data.posed import PosedImages
 from lsmgeo.errors import DataError
 
-__all__ = ["is_transforms", "read_transforms", "transforms_files"]
+__all__ = ["is_transforms", "read_transforms"]
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+# The first of these that a folder has.
+NAMES = ("transforms.json", "transforms_*.json")
 MOST_FRAMES = 100_000
 # nerfstudio's depth is in millimetres where the file says nothing else.
 DEPTH_STEP = 1e-3
@@ -35,18 +45,10 @@ WITHOUT_MEANING = {"perspective": ("k4", "k5", "k6"), "fisheye": ("p1", "p2")}
 REFUSED = ("ftheta_p0", "latlong", "equirectangular", "from_na")
 
 
-def transforms_files(folder: Path) -> list[Path]:
-    """``transforms.json`` of a folder, else all its ``transforms_*.json``, sorted."""
-    plain = folder / "transforms.json"
-    if plain.is_file():
-        return [plain]
-    return sorted(path for path in folder.glob("transforms_*.json") if path.is_file())
-
-
 def is_transforms(path: Path) -> bool:
     """Whether a folder holds such files, or a JSON file such frames."""
     if path.is_dir():
-        return bool(transforms_files(path))
+        return bool(plain_files(path, *NAMES))
     return path.suffix.lower() == ".json" and isinstance(peek_json(path).get("frames"), list)
 
 
@@ -77,12 +79,7 @@ def read_transforms(path: str | Path) -> PosedImages:
         DataError: a file is missing, damaged or too large, names a file outside its folder, states a camera that makes
             no sense or is of another size than its picture, or the folder holds several files.
     """
-    path = Path(path)
-    files = transforms_files(path) if path.is_dir() else [path]
-    if len(files) != 1:
-        found = ", ".join(file.name for file in files[:5]) or "none"
-        raise DataError(path, f"expected transforms.json or one transforms_*.json; found {found}: name the one meant")
-    file = files[0]
+    file = one_file(Path(path), *NAMES)
     values = read_json(file)
     frames = values.get("frames")
     if not isinstance(frames, list) or not 1 <= len(frames) <= MOST_FRAMES:
@@ -127,7 +124,7 @@ def _picture(file: Path, name: str) -> Path:
     path = child(file.parent, name, file)
     if path.is_file():
         return path
-    for suffix in SUFFIXES:
+    for suffix in (*SUFFIXES, *(suffix.upper() for suffix in SUFFIXES)):
         longer = child(file.parent, name + suffix, file)
         if longer.is_file():
             return longer
@@ -139,8 +136,7 @@ def _pose(frame: dict[str, Any], file: Path, where: str) -> np.ndarray:
     short = isinstance(rows, list) and len(rows) == 3
     pose = np.eye(4)
     pose[: 3 if short else 4] = take_array(frame, "transform_matrix", (3 if short else 4, 4), file, where)
-    if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise DataError(file, f"{where}: the last row of transform_matrix must be 0 0 0 1")
+    check_last_row(pose, file, f"{where}: transform_matrix")
     check_rotation(pose[:3, :3], file, where)
     return pose
 

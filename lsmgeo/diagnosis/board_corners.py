@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.data.files import read_image
+from lsmgeo.data.images import read_image
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

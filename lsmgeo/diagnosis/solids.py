@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.data.binvox import binvox_files, is_binvox, read_binvox
+from lsmgeo.data.binvox import PATTERN, is_binvox, read_binvox
+from lsmgeo.data.files import plain_files
 from lsmgeo.data.meshes import load_mesh
 from lsmgeo.diagnosis.findings import Cause, Check, Findings, Gap
 from lsmgeo.errors import DataError
@@ -114,7 +115,7 @@ def _is_solid_file(path: Path) -> bool:
 def _find_mesh(path: Path) -> Path | None:
     try:
         folder = path if path.is_dir() else path.parent
-        solids = binvox_files(path) if path.is_dir() else [path]
+        solids = plain_files(path, PATTERN) if path.is_dir() else [path]
         meshes = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
     except OSError as error:
         raise DataError(path, f"cannot be read ({error})") from error

@@ -13,7 +13,7 @@ from PIL.PngImagePlugin import PngInfo
 from lsmgeo import data
 from lsmgeo.data import colmap
 from lsmgeo.data.depth_files import DepthPng
-from lsmgeo.data.files import read_cut_out, read_image
+from lsmgeo.data.images import read_cut_out, read_image
 from lsmgeo.data.lenses import Lens
 from lsmgeo.errors import CameraError, DataError
 from tests.data import posed_writers

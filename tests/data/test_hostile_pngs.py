@@ -6,7 +6,7 @@ import zlib
 import numpy as np
 import pytest
 
-from lsmgeo.data.png import DEPTH, RGBA, decode_png, encode_png
+from lsmgeo.data.images import DEPTH, RGBA, decode_png, encode_png
 from tests.data.hostile import TAR, judged, mutated, read_all, refused, rewritten
 from tests.data.shapes import write_set
 from tests.fuzz import forked

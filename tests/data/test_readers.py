@@ -6,7 +6,7 @@ import torch
 from PIL import Image
 
 from lsmgeo import data
-from lsmgeo.data.files import image_size
+from lsmgeo.data.images import image_size
 from lsmgeo.errors import DataError
 from tests.data.writers import make_scene, project, write_colmap, write_middlebury
 
@@ -115,7 +115,7 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     assert [file.name for file in tmp_path.iterdir()] == ["result"]
 
 
-@pytest.mark.parametrize("step", ["os.fdopen", "os.fsync", "pathlib.Path.chmod", "pathlib.Path.replace"])
+@pytest.mark.parametrize("step", ["os.open", "os.write", "os.fsync", "pathlib.Path.replace"])
 def test_an_interrupted_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch, step):
     path = data.write_atomic(tmp_path / "result", b"old")
     monkeypatch.setattr(step, interrupt)

@@ -95,7 +95,7 @@ class Stops:
 
     def __init__(self, monkeypatch, at=None):
         self.count, self.at = 0, at
-        for owner, name in ((files.AtomicFile, "write"), (files.os, "fsync"), (Path, "replace"), (Path, "chmod"),
+        for owner, name in ((files.AtomicFile, "write"), (files.os, "fsync"), (Path, "replace"),
                             (Path, "unlink")):  # fmt: skip
             monkeypatch.setattr(owner, name, self.wrapped(getattr(owner, name)))
 
@@ -119,6 +119,7 @@ def test_a_killed_writer_leaves_no_half_shard(tmp_path, monkeypatch, before):
     shape, other = make_shape(0, views=1), make_shape(1, views=1)
     items = [(0, shape.members(0))]
     expected = tmp_path / "expected"
+    expected.mkdir()
     with monkeypatch.context() as patch:
         stops = Stops(patch)
         write_shard(expected / "a.tar", items, SETTINGS)

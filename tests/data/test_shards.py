@@ -16,7 +16,7 @@ from PIL import Image
 
 from lsmgeo import scenes
 from lsmgeo.data import ShardSet, encode_sample, hash_settings, shard_reading, verify_shard, write_shard
-from lsmgeo.data.png import DEPTH, RGBA, decode_png, encode_png
+from lsmgeo.data.images import DEPTH, RGBA, decode_png, encode_png
 from lsmgeo.errors import CameraError, DataError, DTypeError, OptionError, ShapeError
 from tests.data.shapes import SETTINGS, STEP, assert_equal, make_shape, write_set
 

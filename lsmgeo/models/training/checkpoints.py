@@ -24,8 +24,8 @@ from torch import Tensor, nn
 
 import lsmgeo
 from lsmgeo._checks import check_whole
-from lsmgeo.errors import CheckpointError, OptionError
-from lsmgeo.models.training.durable import clear_leftovers, make_folder, put_file, put_folder, remove_folder
+from lsmgeo.data.files import atomic_folder, clear_leftovers, remove_folder, write_atomic
+from lsmgeo.errors import CheckpointError, DataError, OptionError
 from lsmgeo.models.weights import (
     CHECKPOINTS,
     STEP,
@@ -141,19 +141,20 @@ def save_checkpoint(
     files = {WEIGHTS: encode_weights(model, about=about), STATE: _encode_state(state)}
     files[META] = _encode_meta(files, step, config, best)
     try:
-        make_folder(folder)
         clear_leftovers(folder)
-        put_folder(final, files)
-    except OSError as error:
-        raise CheckpointError(final, f"cannot be written ({error})") from error
+        with atomic_folder(final, replace=True) as made:
+            for name, content in files.items():
+                write_atomic(made / name, content)
+    except DataError as error:
+        raise CheckpointError(final, error.reason) from error
     # From here on the checkpoint stands, and the next one makes up for what fails.
     try:
-        put_file(folder / LATEST, f"{final.name}\n".encode())
+        write_atomic(folder / LATEST, f"{final.name}\n".encode())
         # Those of later steps are damaged, or this run would have begun with them; they go when it reaches their steps.
         for number in [number for number in checkpoint_folders(folder) if number <= step][keep:]:
             if number != best:
                 remove_folder(folder / step_folder(number))
-    except OSError as error:
+    except DataError as error:
         warnings.warn(f"{final} is saved; tidying up after it failed ({error})", stacklevel=2)
     return final
 

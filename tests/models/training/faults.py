@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 # What the protocol of a save asks of the system.
-CALLS = ("mkdir", "open", "write", "fsync", "close", "rename", "unlink", "rmdir")
+CALLS = ("mkdir", "open", "write", "fsync", "close", "replace", "unlink", "rmdir")
 
 
 def in_child(work: Callable[[], object], *, timeout: float = 120.0, quiet: bool = True) -> int:
@@ -109,4 +109,4 @@ def fill(_: str) -> None:
 
 def leftovers(folder: Path) -> list[str]:
     """What does not belong into a run's folder of checkpoints."""
-    return sorted(item.name for item in folder.iterdir() if ".tmp-" in item.name or ".old-" in item.name)
+    return sorted(item.name for item in folder.iterdir() if item.name.endswith(".tmp") or ".old-" in item.name)

@@ -1,4 +1,4 @@
-"""PNG by OpenCV: written fast, and read strictly where size and kind are known.
+"""Image files: photographs in, PNG out, and PNG of known size and kind in.
 
 OpenCV refuses what is damaged, but it guesses the kind from the content, allocates what the file announces, and
 inflates what no pixel needs. So the container is looked at first: the header must be the expected one, every chunk must
@@ -8,7 +8,9 @@ comments) are not given to the decoder.
 
 from __future__ import annotations
 
+import contextlib
 import struct
+import warnings
 import zlib
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,13 +19,35 @@ import numpy as np
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from os import PathLike
+    from pathlib import Path
 
-__all__ = ["DEPTH", "RGBA", "PngKind", "decode_png", "encode_png"]
+    from PIL import Image
 
+__all__ = [
+    "DEPTH",
+    "MAX_IMAGE_BYTES",
+    "MAX_PIXELS",
+    "RGBA",
+    "SUFFIXES",
+    "PngKind",
+    "decode_png",
+    "encode_png",
+    "has_alpha",
+    "image_size",
+    "read_cut_out",
+    "read_image",
+]
+
+# Room for the 24 and 61 megapixels of today's cameras, below the size at which Pillow itself suspects a bomb.
+MAX_PIXELS = 1 << 26
+MAX_IMAGE_BYTES = 4096 + 8 * MAX_PIXELS
+# What the names of pictures end with, in small letters.
+SUFFIXES = (".png", ".jpg", ".jpeg")
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 LEVEL = 3
-SHAPES = {np.dtype(np.uint8): ((), (3,), (4,)), np.dtype(np.uint16): ((),)}
+ENCODED = {np.dtype(np.uint8): ((), (3,), (4,)), np.dtype(np.uint16): ((),)}
 
 
 class PngKind(NamedTuple):
@@ -58,7 +82,7 @@ def encode_png(pixels: np.ndarray) -> bytes:
     """
     import cv2
 
-    if pixels.ndim < 2 or pixels.shape[2:] not in SHAPES.get(pixels.dtype, ()) or 0 in pixels.shape:
+    if pixels.ndim < 2 or pixels.shape[2:] not in ENCODED.get(pixels.dtype, ()) or 0 in pixels.shape:
         raise ValueError(
             f"pixels must be (H, W), (H, W, 3) or (H, W, 4) uint8, or (H, W) uint16; got {pixels.shape} {pixels.dtype}"
         )
@@ -120,3 +144,90 @@ def decode_png(
     if pixels is None or pixels.shape != (*size, *kind.channels) or pixels.dtype != kind.dtype:
         raise DataError(path, f"{where}is a damaged picture")
     return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA) if kind.channels else pixels
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """The (height, width) that a PNG or JPEG states in its header; no pixel is decoded.
+
+    Raises:
+        DataError: not a PNG or JPEG, or more than `MAX_PIXELS`.
+    """
+    with _open_image(path) as image:
+        return image.size[1], image.size[0]
+
+
+def has_alpha(path: Path) -> bool:
+    """Whether a PNG or JPEG says in its header that it has transparent pixels; none is decoded.
+
+    Raises:
+        DataError: as `image_size`.
+    """
+    with _open_image(path) as image:
+        return image.mode in ("RGBA", "LA") or "transparency" in image.info
+
+
+def read_image(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
+    """Read a PNG or JPEG photograph as 8-bit RGB.
+
+    The pixels come as they are stored: an orientation that EXIF states is not applied, as COLMAP and instant-ngp do not
+    apply it.
+
+    Args:
+        path: the image file.
+        size: expected (height, width); checked before a pixel is decoded.
+
+    Returns:
+        (H, W, 3) uint8.
+
+    Raises:
+        DataError: not a PNG or JPEG, another size than expected, too large, or damaged.
+    """
+    return _read(path, size, "RGB")
+
+
+def read_cut_out(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
+    """Read a PNG or JPEG as 8-bit RGBA, alpha 255 where it has none; otherwise as `read_image`.
+
+    Returns:
+        (H, W, 4) uint8, not premultiplied.
+    """
+    return _read(path, size, "RGBA")
+
+
+def _read(path: Path, size: tuple[int, int] | None, mode: str) -> np.ndarray:
+    with _open_image(path) as image:
+        width, height = image.size
+        if size is not None and (height, width) != tuple(size):
+            reason = f"is {width} x {height} pixels (width x height); its camera expects {size[1]} x {size[0]}"
+            raise DataError(path, reason)
+        if image.mode not in ("1", "L", "LA", "P", "RGB", "RGBA", "CMYK"):
+            raise DataError(path, f"has mode {image.mode}; expected an 8-bit picture")
+        return np.array(image.convert(mode))
+
+
+@contextlib.contextmanager
+def _open_image(path: Path) -> Iterator[Image.Image]:
+    from PIL import Image
+
+    try:
+        # A pipe or a device would block or never end, so only plain files are opened at all.
+        if not path.is_file():
+            raise DataError(path, "no such file")
+        if path.stat().st_size > MAX_IMAGE_BYTES:
+            raise DataError(path, f"is larger than the limit of {MAX_IMAGE_BYTES} bytes")
+        with warnings.catch_warnings():
+            # Pillow warns of palettes and of second pictures in a JPEG, which are read as they should be.
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            # Sniffing among all of Pillow's formats would reach parsers (EPS, FITS) that run programs or expand files.
+            # The file itself, not its bytes: of hundreds of photographs only the headers are read when a scene opens.
+            with path.open("rb") as stream, Image.open(stream, formats=("PNG", "JPEG")) as image:
+                width, height = image.size
+                if width * height > MAX_PIXELS:
+                    raise DataError(path, f"has {width} x {height} pixels, the limit is {MAX_PIXELS}")
+                yield image
+    except DataError:
+        raise
+    # Pillow's decoders raise OSError, SyntaxError, ValueError, struct.error, zlib.error and more on damaged files.
+    except Exception as error:
+        raise DataError(path, f"is not a readable PNG or JPEG picture ({error})") from error

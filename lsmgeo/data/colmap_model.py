@@ -253,9 +253,9 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
         if len(tokens) < 4:
             raise DataError(path, f"{where}: expected id, model, width, height and parameters")
         name, number = _find_model(tokens[1], path)
+        camera_id, width, height = parse_ints([tokens[0], *tokens[2:4]], path, where)
         if len(tokens) - 4 != number:
             raise DataError(path, f"{where}: {name} has {number} parameters; got {len(tokens) - 4}")
-        camera_id, width, height = parse_ints([tokens[0], *tokens[2:4]], path, where)
         yield camera_id, ColmapCamera(name, width, height, tuple(parse_floats(tokens[4:], path, where)))
 
 
@@ -289,10 +289,11 @@ def _text_points(path: Path) -> Iterator[tuple[int, tuple[float, ...], tuple[int
             continue
         if len(tokens) < 8:
             raise DataError(path, f"{where}: expected id, position, colour and error")
+        position = parse_floats(tokens[1:4], path, where)
         point_id, *colour = parse_ints([tokens[0], *tokens[4:7]], path, where)
         if not all(0 <= value <= 255 for value in colour):
             raise DataError(path, f"{where}: colours must lie in 0..255")
-        yield point_id, tuple(parse_floats(tokens[1:4], path, where)), tuple(colour)
+        yield point_id, tuple(position), tuple(colour)
 
 
 READERS = {

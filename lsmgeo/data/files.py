@@ -72,11 +72,11 @@ def refuse_unreadable(read: Callable[Options, Content]) -> Callable[Options, Con
     """Make what the system says while a reader looks around a `DataError` of the path, its first argument."""
 
     @functools.wraps(read)
-    def refusing(*args: Options.args, **options: Options.kwargs) -> Content:
-        with refusing(args[0] if args else options["path"], "read"):
+    def reading(*args: Options.args, **options: Options.kwargs) -> Content:
+        with refusing(str(args[0] if args else options["path"]), "read"):
             return read(*args, **options)
 
-    return refusing
+    return reading
 
 
 def read_bytes(path: Path, limit: int) -> bytes:

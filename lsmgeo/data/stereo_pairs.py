@@ -111,7 +111,7 @@ def read_stereo_pair(path: str | Path) -> PosedImages:
         stated = tuple(parse_ints([entries["height"], entries["width"]], file, "height and width"))
         for picture, size in zip(paths, sizes, strict=True):
             check_picture((stated[0], stated[1]), size, picture, file, "width and height")
-    cameras = make_cameras((first, second), [np.eye(3)] * 2, [[0, 0, 0], [-baseline, 0, 0]], sizes, file)
+    cameras = make_cameras((first, second), [np.eye(3)] * 2, np.array([[0.0] * 3, [-baseline, 0.0, 0.0]]), sizes, file)
     depths = []
     for names in DISPARITIES:
         here = [child(folder, name, file) for name in names if (folder / name).exists()]

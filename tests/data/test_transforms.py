@@ -210,7 +210,7 @@ def scaled(pose):
         (lambda values: matrix(values, scaled), r"frame 1: the rotation is scaled by 2\.5; divide"),
         (lambda values: matrix(values, lambda m: m * [[1, -1, 1, 1]]), "frame 1: the rotation is mirrored"),
         (lambda values: matrix(values, lambda m: m + [[0.1, 0, 0, 0]] * 4), "last row|the rotation is none"),
-        (lambda values: matrix(values, lambda m: m.T), "last row of transform_matrix must be 0 0 0 1"),
+        (lambda values: matrix(values, lambda m: m.T), "transform_matrix must have the last row 0 0 0 1"),
         (lambda values: matrix(values, lambda m: m[:2]), "transform_matrix must be 4 x 4 numbers"),
         (lambda values: values["frames"][1].update(w=128, h=96), "of 128 x 96 pixels .*: K of another resolution"),
         (lambda values: values["frames"][1].update(w=59.5), "w must be a whole number"),

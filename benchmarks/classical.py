@@ -1,77 +1,274 @@
-"""What the classical machine reaches: ``python -m benchmarks.classical [--only NAME]``.
+"""What classical reconstruction reaches on photographs whose geometry is known; all its sections are run from here.
 
-One table of everything: analytic scenes, photographs, silhouettes, fusion, speed. Each figure stands beside the one
-that it was to reach, or beside the rivals', which run here too, with settings that `benchmarks.classical_baselines`
-holds.
-
-Densities are fractions of all pixels of a view, taken in the order of the method's own confidence; an error at a
-density is over those of them whose true value is known. "Bad-2" is the fraction whose disparity is off by more than two
-pixels.
-
-The folder of sets is the one that ``LSMGEO_TEST_DATA`` names; figures that need it are left out without. The sets
-themselves cannot be distributed; the results that are kept hold figures alone.
+Each figure has the one that it was to reach beside it, or the rivals', which run here too, with settings that
+`benchmarks.classical_rivals` holds. Densities are fractions of all pixels of a view, taken in the order of the method's
+own confidence; an error at a density is over those of them whose true value is known. "Bad-2" is the fraction whose
+disparity is off by more than two pixels.
 """
 
 from __future__ import annotations
 
-import argparse
-import importlib
-import json
-import os
-import sys
+import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import torch
 
-from benchmarks import report, timing
-from benchmarks.classical_rows import Row
+from benchmarks import classical_exact, classical_rivals
+from benchmarks.classical_rivals import Found, bad_at, luminance, matchers, median_at, plain_sweep, row, winners
+from benchmarks.known_sets import BASELINE, FOCAL_LENGTH, OFFSET, write_motorcycle
+from benchmarks.measuring import Settings
+from benchmarks.triangulated import Depths, find_features, triangulate
+from lsmgeo import VoxelGrid, data, functional
+from lsmgeo.cameras import CameraTensors, resize, select, stack
+from lsmgeo.classical import Reconstruction, hull_box, reconstruct_scene, silhouettes, visual_hull
+from lsmgeo.classical.tsdf import voxel_side
 
-SECTIONS = ("analytic", "stereo", "rgbd", "posed", "hull", "tsdf", "speed")
-
-
-def measure(section: str, root: Path | None) -> tuple[list[Row], dict[str, Any]]:
-    """The rows of a section, and the numbers that its curves are drawn from, where it has any."""
-    module = importlib.import_module(f"benchmarks.classical_{section}")
-    if hasattr(module, "measure") and root is not None:
-        rows, figures = module.measure(root)
-        return rows, figures
-    return module.rows(root), {}
+Section = tuple[list[dict[str, Any]], dict[str, Any]]  # rows of the table, and the numbers that curves are drawn from
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measure, print the table, keep the figures; 1 if one is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=os.environ.get("LSMGEO_TEST_DATA"), help="folder of the sets")
-    parser.add_argument("--only", default="", choices=("", *SECTIONS), help="one section; its rows alone are replaced")
-    options = parser.parse_args(arguments)
-    root = options.data if options.data is not None and options.data.is_dir() else None
-    if root is None:
-        print("no folder of sets: --data, or LSMGEO_TEST_DATA, names none; figures that need it are left out")
-    rows: list[Row] = []
-    measured: dict[str, dict[str, Any]] = {}
-    for section in (options.only,) if options.only else SECTIONS:
-        start = time.perf_counter()
-        found, figures = measure(section, root)
-        rows += found
-        measured[section] = {
-            "section": section,
-            "seconds": time.perf_counter() - start,
-            "rows": [row._asdict() for row in found],
-            **figures,
+def found_in(one: Reconstruction) -> Found:
+    """The depths of a view, and how far they are trusted."""
+    depth = one.depth_map.depth.double().numpy()
+    return Found(np.where(depth > 0, depth, np.nan), one.depth_map.confidence.numpy())
+
+
+# The search range of all methods: whole disparities for those that take no others.
+FIRST, LAST = 4, 64
+THRESHOLD = 2.0
+DENSITIES = tuple(tenth / 10 for tenth in range(1, 11))
+
+
+def depth_of(disparity: Any) -> Any:
+    """Z = f B / (d + doffs), millimetres."""
+    return FOCAL_LENGTH * BASELINE / (disparity + OFFSET)
+
+
+def disparity_of(depth: np.ndarray) -> np.ndarray:
+    """NaN where there is no depth."""
+    with np.errstate(divide="ignore"):
+        return np.where(depth > 0, FOCAL_LENGTH * BASELINE / depth - OFFSET, np.nan)
+
+
+def motorcycle(root: Path, planes: int = 300, *, unfiltered: bool = True) -> tuple[dict[str, Found], np.ndarray, float]:
+    """Disparities of all methods, the true ones, and the fraction of our pixels that both directions agree on.
+
+    OpenCV's matchers say only whether they trust a pixel: their curves have a single point.
+    """
+    with tempfile.TemporaryDirectory() as scratch:
+        scene = data.open(write_motorcycle(root, Path(scratch)))
+        images = [scene.load(view) for view in (0, 1)]
+        true = disparity_of(np.asarray(scene.load_depth(0), np.float64))
+        options = {"near": depth_of(LAST), "far": depth_of(FIRST), "size": max(true.shape), "planes": planes}
+        ours = {
+            f"ours, {name}": reconstruct_scene(
+                scene, density=1.0, mesh=False, filtered=name == "filtered", **options
+            ).views[0]
+            for name in ("filtered", "unfiltered")[: 1 + unfiltered]
         }
-    report.show(report.reached_rows(list(measured.values())))
-    missed = [row for row in rows if row.reached is False]
-    print(f"{sum(row.reached is True for row in rows)} figures reached, {len(missed)} missed")
-    if root is not None:
-        path = timing.RESULTS / "classical.json"
-        kept = json.loads(path.read_text(encoding="utf-8"))["cases"] if options.only and path.is_file() else []
-        cases = {**{case["section"]: case for case in kept}, **measured}
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-        print(timing.save("classical", timing.machine(device), [cases[name] for name in SECTIONS if name in cases]))
-    return int(bool(missed))
+        plain = plain_sweep([luminance(image) for image in images], scene.cameras, depth_of(np.arange(FIRST, LAST + 1)))
+    depths = {name: found_in(one) for name, one in ours.items()} | {"plain ZNCC": plain}
+    methods = {name: found._replace(value=disparity_of(found.value)) for name, found in depths.items()}
+    methods |= matchers(*((image.permute(1, 2, 0) * 255).round().byte().numpy() for image in images))
+    agreed = ours["ours, filtered"].support
+    return methods, true, float((agreed > 0).float().mean()) if agreed is not None else 0.0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def curve(method: Found, true: np.ndarray) -> tuple[list[float], list[float]]:
+    """Densities, of all pixels, and the fraction of wrong pixels at each; one density where confidence has no order."""
+    most = float(np.isfinite(method.value).mean())
+    levels = [density for density in DENSITIES if density < most] + [most]
+    levels = [most] if len(np.unique(method.confidence)) <= 2 else levels
+    return levels, [bad_at(method, true, density, THRESHOLD) for density in levels]
+
+
+def stereo(root: Path) -> Section:
+    """Middlebury's motorcycle: our sweep of a rectified pair against OpenCV's two matchers and the plainest sweep."""
+    methods, true, agreed = motorcycle(root)
+    curves = {name: dict(zip(("density", "bad"), curve(method, true), strict=True)) for name, method in methods.items()}
+    rows = [
+        row("motorcycle", f"bad-2 at {100 * density:.0f} % density, {name}", f"{100 * bad:.1f} %")
+        for name, drawn in curves.items()
+        for density, bad in zip(drawn["density"], drawn["bad"], strict=True)
+        if density in (0.4, 0.7, drawn["density"][-1])
+    ]
+    ours, plain, rival = (methods[name] for name in ("ours, filtered", "plain ZNCC", "StereoSGBM"))
+    # Our valid pixels are those on which both directions agree.
+    density = min(agreed, float(np.isfinite(ours.value).mean()))
+    both = winners(ours, density) & np.isfinite(rival.value) & np.isfinite(true)
+    mine, theirs = (100 * float((np.abs(method.value - true)[both] > THRESHOLD).mean()) for method in (ours, rival))
+    what = f"bad-2 on pixels valid in both, ours at {100 * density:.0f} % density, over StereoSGBM's"
+    measured, reached = f"{mine:.2f} % : {theirs:.2f} % = {mine / theirs:.2f}", density >= 0.7 and mine <= 1.5 * theirs
+    rows.append(row("motorcycle", what, measured, "at most 1.5 at 70 % or more", reached))
+    fewer = sum(bad_at(ours, true, level, THRESHOLD) < bad_at(plain, true, level, THRESHOLD) for level in DENSITIES)
+    what = "densities of 10 at which ours has fewer bad pixels than plain ZNCC"
+    rows.append(row("motorcycle", what, str(fewer), "all 10", fewer == 10))
+    return rows, {"bad_pixel_curves": curves, "threshold_px": THRESHOLD}
+
+
+WALK_DENSITIES = (0.1, 0.2, 0.4)
+
+
+def walk(root: Path, views: list[int] | None = None) -> dict[str, np.ndarray]:
+    """The median relative depth error of every frame (rows) at every density (columns), of both methods."""
+    scene = data.open(root / "hololens_rgbd")
+    options: Any = {"near": 0.7, "far": 8.0, "planes": 128, "size": 540, "density": 1.0, "mesh": False}
+    table: dict[str, list[list[float]]] = {"ours": [], "plain ZNCC": []}
+    for one in reconstruct_scene(scene, views, progress=True, **options).views:
+        depth = scene.load_depth(one.view)
+        assert depth is not None
+        height, width = one.mask.shape
+        y, x = (
+            np.round((np.arange(n) + 0.5) * m / n - 0.5).astype(int)
+            for n, m in zip((height, width), depth.shape, strict=True)
+        )
+        measured = depth.double().numpy()[np.ix_(y, x)]
+        true = np.where(measured > 0, measured, np.nan)
+        seen = (one.view, *one.neighbours)
+        pictures = (luminance(scene.load(view)) for view in seen)
+        images = [cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA) for picture in pictures]
+        cameras = stack([resize(scene.camera(view), height, width) for view in seen])
+        plain = plain_sweep(images, cameras, one.depths.numpy())
+        for name, method in (("ours", found_in(one)), ("plain ZNCC", plain)):
+            table[name].append([median_at(method, true, density) for density in WALK_DENSITIES])
+    return {name: np.array(values) for name, values in table.items()}
+
+
+def rgbd(root: Path) -> Section:
+    """Frames of a walk through a room with measured depth: our sweep against the plainest, frame by frame."""
+    found = walk(root)
+    frames, (middle, middle_plain) = len(found["ours"]), (np.median(found[name], axis=0) for name in found)
+    rows = []
+    for density, ours, plain in zip(WALK_DENSITIES, middle, middle_plain, strict=True):
+        what = f"median depth error at {100 * density:.0f} % density over plain ZNCC's, middle of {frames} frames"
+        measured = f"{100 * ours:.1f} % : {100 * plain:.1f} % = {ours / plain:.2f}"
+        rows.append(row("HoloLens", what, measured, "at most 0.5" if density == 0.4 else "", ours <= 0.5 * plain))
+    ratios = found["ours"][:, -1] / found["plain ZNCC"][:, -1]
+    what = f"frames of {frames} whose error at 40 % density is at most half of plain ZNCC's"
+    measured = f"{int((ratios <= 0.5).sum())}, largest ratio {ratios.max():.2f}"
+    rows.append(row("HoloLens", what, measured, "all", (ratios <= 0.5).all()))
+    return rows, {"median_errors": {name: each.tolist() for name, each in found.items()}, "densities": WALK_DENSITIES}
+
+
+POSED = {"fountain": "strecha_fountain_quarter", "temple": "middlebury_temple", "COLMAP scene": "colmap_scene"}
+# So many views next to each other are swept, and agreement is asked of these alone; features are matched among more.
+VIEWS, VIEWS_MATCHED = 3, 8
+
+
+def triangulated_of(scene: data.PosedImages, views: list[int], among: list[int]) -> list[Depths]:
+    """The depths of views' features, in the photographs' own size, from matches among some views."""
+    pictures = (np.rint(255 * luminance(scene.load(view))).astype(np.uint8) for view in among)
+    features = [find_features(picture) for picture in pictures]
+    K, E = (value[among].double().numpy() for value in scene.cameras[:2])
+    return [triangulate(features, K, E, among.index(view)) for view in views]
+
+
+def sparse_of(scene: data.PosedImages, view: int) -> Depths:
+    """The depths of the set's own sparse points that a view observes."""
+    assert scene.points is not None
+    seen = scene.points.observations[view]
+    E = scene.cameras.cam_from_world[view].double().numpy()
+    return Depths(seen.pixels, scene.points.positions[seen.points] @ E[2, :3] + E[2, 3])
+
+
+def errors_at(one: Reconstruction, truth: Depths, full: tuple[int, int], density: float) -> np.ndarray:
+    """Relative depth errors at the places that lie among the pixels that the method trusts most."""
+    found = found_in(one)
+    height, width = found.value.shape
+    x, y = np.floor((truth.pixels + 0.5) * (width / full[1], height / full[0])).astype(int).T
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    x, y, true = x[inside], y[inside], truth.depth[inside]
+    return (np.abs(found.value[y, x] - true) / true)[winners(found, density)[y, x]]
+
+
+def posed(root: Path) -> Section:
+    """Photographs with known cameras and no depth, against triangulated features, and against sparse points."""
+    rows, figures = [], {}
+    for name, folder in POSED.items():
+        scene = data.open(root / folder)
+        views, among = (list(range(min(count, len(scene)))) for count in (VIEWS, VIEWS_MATCHED))
+        judged = reconstruct_scene(scene, views, size=480, mesh=False, density=1.0, progress=True).views
+        truths = {"triangulated features": triangulated_of(scene, views, among)}
+        if scene.points is not None:
+            truths["the set's sparse points"] = [sparse_of(scene, view) for view in views]
+        for kind, depths in truths.items():
+            errors = [
+                errors_at(one, truth, scene.size(one.view), 0.4) for one, truth in zip(judged, depths, strict=True)
+            ]
+            pooled = np.concatenate(errors)
+            median, tenth = 100 * float(np.median(pooled)), 100 * float(np.quantile(pooled, 0.9))
+            what = f"median depth error at 40 % density against {len(pooled)} {kind} in {len(views)} views"
+            rows.append(row(name, what, f"{median:.2f} %, 90 % below {tenth:.1f} %", "at most 0.5 %", median <= 0.5))
+            figures.setdefault(name, {})[kind] = [float(np.median(one)) for one in errors]
+    return rows, {"median_errors": figures}
+
+
+# The box of the temple as the publisher states it, metres.
+PUBLISHED = np.array([(-0.073568, 0.021728, -0.012445), (0.028855, 0.181892, 0.062736)])
+
+
+def project_back(occupancy: torch.Tensor, grid: VoxelGrid, camera: CameraTensors, size: tuple[int, int]) -> Any:
+    """The silhouette of voxels, (h, w) bool: the nearest voxels at depths a voxel apart, the largest along each ray."""
+    depth = (
+        grid.centers().flatten(0, -2) @ camera.cam_from_world[2, :3].to(grid.centers()) + camera.cam_from_world[2, 3]
+    )
+    step = voxel_side(grid)
+    planes = torch.arange(float(depth.min()) - step, float(depth.max()) + 2 * step, step)
+    where = stack([camera]), grid
+    return torch.stack(
+        [
+            functional.plane_sweep_project(occupancy[None, None].float(), *where, some, size, mode="nearest")[0]
+            .amax((0, 1, 2))
+            .gt(0.5)
+            for some in planes.split(64)
+        ]
+    ).any(0)
+
+
+def temple(root: Path) -> Section:
+    """The hull of a temple, in a box told from its silhouettes alone: projected back over these, and its own box."""
+    scene = data.open_scene(root / "middlebury_temple")
+    masks = silhouettes(scene)
+    grid, views = VoxelGrid(192, *hull_box(masks, scene.cameras)), range(len(scene))
+    rows, title = [], "Visual hull, temple, 192^3"
+    for rule, name in (("all", "strict intersection"), ("mean", "mean above 0.75")):
+        occupancy = visual_hull(torch.stack(masks), scene.cameras, grid, rule=rule).occupancy
+        drawn = [project_back(occupancy, grid, select(scene.cameras, 0, view), scene.size(view)) for view in views]
+        scores = [float((a & b).sum() / (a | b).sum()) for a, b in zip(drawn, masks, strict=True)]
+        sites, half = grid.centers()[occupancy], grid.world_from_lattice.diagonal()[:3] / 2
+        away = 1000 * (torch.stack((sites.amin(0) - half, sites.amax(0) + half)).numpy() - PUBLISHED)
+        lower, upper = (", ".join(f"{item:+.1f}" for item in end) for end in away)
+        what = f"{name}: IoU of its silhouettes with those given, mean of {len(scene)} views"
+        measured, goals = f"{np.mean(scores):.4f} (least {min(scores):.4f})", (">= 0.88", "<= 20 mm")
+        goals = goals if rule == "all" else ("", "")
+        rows.append(row(title, what, measured, goals[0], np.mean(scores) >= 0.88))
+        what, far = f"{name}: its box from the published one, six faces", np.abs(away).max()
+        rows.append(row(title, what, f"most {far:.1f} mm (lower {lower}; upper {upper})", goals[1], far <= 20))
+    return rows, {}
+
+
+# What needs the folder of sets, and what does not.
+PHOTOGRAPHS: dict[str, Callable[[Path], Section]] = {"stereo": stereo, "rgbd": rgbd, "posed": posed, "hull": temple}
+EXACT = {
+    "analytic": classical_exact.analytic,
+    "hull": classical_exact.hull,
+    "tsdf": classical_exact.tsdf,
+    "speed": classical_rivals.speed,
+}
+
+
+def measure(settings: Settings) -> list[dict[str, Any]]:
+    """A case of rows for each section."""
+    cases = []
+    for name in ("analytic", "stereo", "rgbd", "posed", "hull", "tsdf", "speed"):
+        if settings.only in name:
+            start = time.perf_counter()
+            is_here = name in PHOTOGRAPHS and settings.data is not None
+            rows, figures = PHOTOGRAPHS[name](settings.data) if is_here else ([], {})
+            rows += EXACT[name]() if name in EXACT else []
+            cases.append({"section": name, "seconds": time.perf_counter() - start, "rows": rows, **figures})
+    return cases

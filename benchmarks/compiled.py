@@ -9,7 +9,6 @@ second graph, compiled for one thread there, that computes the taps again and pa
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.problems import IMAGE, LeftOut, Run, Scene
-from benchmarks.rivals import NEAR, feature_intrinsics
+from benchmarks.rivals import NEAR, feature_intrinsics, pixel_rays
 
 MOST_VIEWS = 4  # statistics unroll the views, and each number of them is compiled anew
 
@@ -48,9 +47,6 @@ class Samples(NamedTuple):
 
     def of_view(self, v: int) -> Samples:
         return Samples([axis[:, v] for axis in self.index], self.sizes, self.front[:, v], self.first[:, v])
-
-    def corners(self, mode: str) -> int:
-        return 1 if mode == "nearest" else 2 ** len(self.index)
 
     def tap(self, mode: str, corner: int | Tensor) -> tuple[Tensor, Tensor]:
         """A row of the table and its weight; both (..., corners) where `corner` holds several."""
@@ -96,10 +92,14 @@ def volume_samples(center: Tensor, rays: Tensor, depths: Tensor, side: int) -> S
     return Samples(index, [side, side, side], torch.ones_like(index[0], dtype=torch.bool), first)
 
 
+def corners(samples: Samples, mode: str) -> int:
+    return 1 if mode == "nearest" else 2 ** len(samples.index)
+
+
 def blend(table: Tensor, samples: Samples, mode: str) -> Tensor:
     """Rows of (rows, C), weighted and added: (..., C)."""
     value = 0.0
-    for corner in range(samples.corners(mode)):
+    for corner in range(corners(samples, mode)):
         row, weight = samples.tap(mode, corner)
         value = value + table[row].float() * weight[..., None]
     return value
@@ -107,7 +107,7 @@ def blend(table: Tensor, samples: Samples, mode: str) -> Tensor:
 
 def scatter(table: Tensor, values: Tensor, samples: Samples, mode: str) -> Tensor:
     """The adjoint of `blend`: values (..., C) added to the table's rows, all taps of a sample in one pass."""
-    row, weight = samples.tap(mode, torch.arange(samples.corners(mode), device=table.device))
+    row, weight = samples.tap(mode, torch.arange(corners(samples, mode), device=table.device))
     return table.index_put((row,), values[..., None, :] * weight[..., None], accumulate=True)
 
 
@@ -116,100 +116,76 @@ def share(visible: Tensor) -> Tensor:
     return 1.0 / visible.sum(1).clamp(min=1).float()
 
 
-def forward_of(statistic: str, find: Find, mode: str) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
-    """(table, geometry) to values, visibility and the views' mean, which the variance's backward needs."""
+@lru_cache
+class Graphs:
+    """What is compiled for one kind of call. All take a table and the geometry of its samples."""
 
-    def forward(table: Tensor, *geometry: Any) -> tuple[Tensor, Tensor, Tensor]:
-        samples = find(*geometry)
+    def __init__(self, operator: str, statistic: str, mode: str, dynamic: bool, device: str) -> None:
+        self.find = volume_samples if operator == "sweep" else image_samples
+        self.statistic, self.mode = statistic, mode
+        torch._dynamo.config.recompile_limit = 64
+        options = {"cpp.threads": 1} if device == "cpu" else None
+        self.forward = torch.compile(self.make_values, dynamic=dynamic)
+        self.spread = torch.compile(self.spread_gradient, dynamic=dynamic)
+        self.backward = torch.compile(self.make_gradient, dynamic=dynamic, options=options)
+        # PyTorch itself transposes slowly.
+        self.turn = torch.compile(lambda values: values.transpose(-1, -2).contiguous(), dynamic=dynamic)
+
+    def make_values(self, table: Tensor, *geometry: Any) -> tuple[Tensor, Tensor, Tensor]:
+        """Values, visibility and the views' mean, which the variance's backward needs."""
+        samples = self.find(*geometry)
         visible = samples.visible()
-        if not statistic:
-            return blend(table, samples, mode).to(table.dtype), visible, table.new_zeros(())  # (B, V, N, C)
+        if not self.statistic:
+            return blend(table, samples, self.mode).to(table.dtype), visible, table.new_zeros(())  # (B, V, N, C)
         total, squares = 0.0, 0.0
         for v in range(visible.shape[1]):
-            value = blend(table, samples.of_view(v), mode) * visible[:, v, :, None]
+            value = blend(table, samples.of_view(v), self.mode) * visible[:, v, :, None]
             total, squares = total + value, squares + value * value
         mean = total * share(visible)[..., None]
-        if statistic == "mean":
+        if self.statistic == "mean":
             return mean.to(table.dtype), visible, table.new_zeros(())
         return (squares * share(visible)[..., None] - mean * mean).to(table.dtype), visible, mean
 
-    return forward
-
-
-def spread_of(statistic: str, find: Find, mode: str) -> Callable[..., Tensor]:
-    """The gradient of a statistic, (B, N, C), as one to the values of each view."""
-
-    def spread(table: Tensor, gradient: Tensor, mean: Tensor, *geometry: Any) -> Tensor:
-        samples = find(*geometry)
+    def spread_gradient(self, table: Tensor, gradient: Tensor, mean: Tensor, *geometry: Any) -> Tensor:
+        """The gradient of a statistic, (B, N, C), as one to the values of each view."""
+        samples = self.find(*geometry)
         visible = samples.visible()
         scale = (share(visible)[:, None] * visible)[..., None]
-        if statistic == "mean":
+        if self.statistic == "mean":
             return scale * gradient[:, None]
-        return 2.0 * (blend(table, samples, mode) - mean[:, None]) * scale * gradient[:, None]
+        return 2.0 * (blend(table, samples, self.mode) - mean[:, None]) * scale * gradient[:, None]
 
-    return spread
-
-
-def backward_of(find: Find, mode: str) -> Callable[..., Tensor]:
-    """The gradient of the views' values as one to the table."""
-
-    def backward(table: Tensor, gradient: Tensor, *geometry: Any) -> Tensor:
-        added = scatter(torch.zeros_like(table, dtype=torch.float32), gradient.float(), find(*geometry), mode)
-        return added.to(table.dtype)
-
-    return backward
-
-
-@dataclass(frozen=True)
-class Graphs:
-    """What is compiled for one kind of call."""
-
-    forward: Callable[..., Any]
-    spread: Callable[..., Any]
-    backward: Callable[..., Any]
-    turn: Callable[..., Any]
-
-
-@lru_cache
-def compiled(operator: str, statistic: str, mode: str, dynamic: bool, device: str) -> Graphs:
-    """Forward, a statistic's gradient to each view, backward, and a transposition, which PyTorch does slowly itself."""
-    find = volume_samples if operator == "sweep" else image_samples
-    torch._dynamo.config.recompile_limit = 64
-    options = {"cpp.threads": 1} if device == "cpu" else None
-    return Graphs(
-        torch.compile(forward_of(statistic, find, mode), dynamic=dynamic),
-        torch.compile(spread_of(statistic, find, mode), dynamic=dynamic),
-        torch.compile(backward_of(find, mode), dynamic=dynamic, options=options),
-        torch.compile(lambda values: values.transpose(-1, -2).contiguous(), dynamic=dynamic),
-    )
+    def make_gradient(self, table: Tensor, gradient: Tensor, *geometry: Any) -> Tensor:
+        """The gradient of the views' values as one to the table."""
+        zeros = torch.zeros_like(table, dtype=torch.float32)
+        return scatter(zeros, gradient.float(), self.find(*geometry), self.mode).to(table.dtype)
 
 
 class Gather(torch.autograd.Function):
     """A compiled forward with a compiled backward; values (..., N, C), or (..., C, N) where `planar`."""
 
     @staticmethod
-    def forward(ctx: Any, table: Tensor, graphs: Graphs, statistic: str, planar: bool, *geometry: Any) -> Any:
+    def forward(ctx: Any, table: Tensor, graphs: Graphs, planar: bool, *geometry: Any) -> Any:
         values, visible, mean = graphs.forward(table, *geometry)
         ctx.save_for_backward(table, mean)
-        ctx.call = graphs, statistic, planar, geometry
+        ctx.call = graphs, planar, geometry
         ctx.mark_non_differentiable(visible)
         return graphs.turn(values) if planar else values, visible
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, _: Any) -> tuple[Any, ...]:
-        graphs, statistic, planar, geometry = ctx.call
+        graphs, planar, geometry = ctx.call
         table, mean = ctx.saved_tensors
-        if planar:
-            gradient = graphs.turn(gradient)
-        if statistic:
+        gradient = graphs.turn(gradient) if planar else gradient
+        if graphs.statistic:
             gradient = graphs.spread(table, gradient, mean, *geometry)
-        return graphs.backward(table, gradient, *geometry), *(None,) * (3 + len(geometry))
+        return graphs.backward(table, gradient, *geometry), *(None,) * (2 + len(geometry))
 
 
 def contender(scene: Scene, dynamic: bool = False, automatic: bool = False) -> Run:
     """The compiled gather form of a problem."""
     problem = scene.problem
-    if problem.operator == "reduce" or problem.statistic not in ("", "mean", "variance"):
+    if problem.operator not in ("unproject", "sweep"):
         raise LeftOut("not written")
     if problem.statistic and problem.V > MOST_VIEWS:
         raise LeftOut(f"unrolls the views; more than {MOST_VIEWS} take long to compile")
@@ -218,46 +194,27 @@ def contender(scene: Scene, dynamic: bool = False, automatic: bool = False) -> R
     K, E = scene.cameras.intrinsics, scene.cameras.cam_from_world
     image, size = (IMAGE, IMAGE), (problem.size, problem.size)
     planar = problem.operator == "sweep" and problem.flatten
-    operator = "sweep" if problem.operator == "sweep" else "images"
-    graphs = compiled(operator, problem.statistic, problem.mode, dynamic, problem.device)
+    graphs = Graphs(problem.operator, problem.statistic, problem.mode, dynamic, problem.device)
 
-    def gather(table: Tensor, *geometry: Any) -> tuple[Tensor, Tensor]:
+    def gather(source: Tensor, axis: int, sites: tuple[int, ...], *geometry: Any) -> tuple[Tensor, Tensor]:
+        table = source.movedim(axis, -1).reshape(-1, problem.C)  # a copy unless channels are innermost
         if automatic:
             values, visible, _ = graphs.forward(table, *geometry)
-            return values.transpose(-1, -2).contiguous() if planar else values, visible
-        return Gather.apply(table, graphs, problem.statistic, planar, *geometry)
-
-    def lifted(features: Tensor) -> tuple[Tensor, Tensor]:
-        table = features.movedim(2, -1).reshape(-1, problem.C)  # a copy unless channels are innermost
-        P = feature_intrinsics(K, image, size) @ E[..., :3, :]
-        centers = scene.grid.centers().to(K)
-        sites = centers.shape[-4:-1]
-        points = centers.reshape(*(centers.shape[:-4] or (1,)), -1, 3)
-        values, visible = gather(table, P, points, problem.size)
-        values = values.movedim(-1, -2)
+            values = values.transpose(-1, -2).contiguous() if planar else values
+        else:
+            values, visible = Gather.apply(table, graphs, planar, *geometry)
+        values = values if planar else values.movedim(-1, -2)  # (B, V, C, N)
         return values.unflatten(-1, sites), visible.unflatten(-1, sites)
 
+    def lifted(features: Tensor) -> tuple[Tensor, Tensor]:
+        P = feature_intrinsics(K, image, size) @ E[..., :3, :]
+        return gather(features, 2, scene.grid.shape, P, scene.grid.centers().to(K).reshape(1, -1, 3), problem.size)
+
     def swept(volume: Tensor) -> tuple[Tensor, Tensor]:
-        table = volume.movedim(1, -1).reshape(-1, problem.C)
-        center, rays = sweep_lines(scene)
-        values, visible = gather(table, center, rays, scene.depths, problem.voxels)
-        sites = (problem.planes, *size)
-        if planar:  # (B, V, C, N)
-            return values.unflatten(-1, sites).flatten(2, 3), visible.unflatten(-1, sites)
-        return values.movedim(-1, -2).unflatten(-1, sites), visible.unflatten(-1, sites)
+        center, rays = pixel_rays(K, E, image, size)
+        side, sites = problem.voxels, (problem.planes, *size)  # positions are in the volume's index units
+        geometry = (center + 0.5) * side - 0.5, rays * side, scene.depths, side
+        maps, visible = gather(volume, 1, sites, *geometry)
+        return maps.flatten(2, 3) if problem.flatten else maps, visible
 
     return swept if problem.operator == "sweep" else lifted
-
-
-def sweep_lines(scene: Scene) -> tuple[Tensor, Tensor]:
-    """Centre (B, V, 3) and rays (B, V, h w, 3) of every pixel, in the volume's index units."""
-    problem = scene.problem
-    K, E = scene.cameras.intrinsics, scene.cameras.cam_from_world
-    side = torch.arange(problem.size, dtype=K.dtype, device=K.device)
-    v, u = torch.meshgrid(side, side, indexing="ij")
-    pixels = torch.stack((u, v, torch.ones_like(u)), -1).reshape(-1, 3)
-    rotation, translation = E[..., :3, :3], E[..., :3, 3]
-    K = feature_intrinsics(K, (IMAGE, IMAGE), (problem.size, problem.size))
-    to_world = rotation.transpose(-1, -2) @ torch.linalg.inv(K)
-    center = -(rotation.transpose(-1, -2) @ translation[..., None])[..., 0]
-    return (center + 0.5) * problem.voxels - 0.5, pixels @ to_world.transpose(-1, -2) * problem.voxels

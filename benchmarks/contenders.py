@@ -1,12 +1,22 @@
-"""Who competes, by the name that the tables print."""
+"""Who competes, by the name that the tables print; the library's own calls."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
+from typing import Any
 
-from benchmarks import compiled, ours, rivals, styles, warps
-from benchmarks.problems import LeftOut, Run, Scene
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from benchmarks import compiled, rivals, styles
+from benchmarks.problems import LeftOut, Run, Scene, channels_last
+from lsmgeo import functional, rays
+from lsmgeo._sites import image_sites, sweep_sites
+from lsmgeo.cameras import CameraTensors
+from lsmgeo.kernels import Options, cpu
 
 OURS = "lsmgeo"
 REFERENCE = "lsmgeo, reference"
@@ -24,16 +34,98 @@ COLD = "floor, fresh memory"
 WARM = "floor, warm memory"
 KERNEL = "kernel, warm memory"
 
+
+def ours(scene: Scene, backend: str = "auto", fused: bool = True) -> Run:
+    """The public call. What is not fused is a sweep, and a convolution over all its channels."""
+    problem, size = scene.problem, (scene.problem.size,) * 2
+    if not fused and problem.operator != "reduce":
+        raise LeftOut("there is nothing to fuse")
+    options: Any = {"mode": mode_of(scene), "backend": backend}
+
+    def lifted(features: Tensor) -> Any:
+        reduce = problem.statistic or None
+        return functional.unproject(features, scene.cameras, scene.grid, reduce=reduce, **options)
+
+    def products(features: Tensor) -> Any:
+        # At the frustum's own pixels nothing is to be interpolated.
+        first = features[:, :1, :, None, scene.window, scene.window]
+        others = CameraTensors(*(field[:, 1:] for field in scene.cameras))
+        volume, _ = functional.unproject(features[:, 1:], others, scene.grid, **options)
+        return (volume * first).mean(2), None
+
+    def swept(volume: Tensor, flatten: bool = problem.flatten) -> Any:
+        where = scene.cameras, scene.grid, scene.depths, size
+        return functional.plane_sweep_project(volume, *where, flatten=flatten, **options)
+
+    def reduced(volume: Tensor) -> Any:
+        if fused:
+            where = scene.cameras, scene.grid, scene.depths, scene.weight, None, size
+            return rays.project_reduce(volume, *where, **options)
+        maps, visible = swept(volume, flatten=True)
+        mapped = conv2d(maps.flatten(0, 1), scene.weight[..., None, None])
+        return mapped.unflatten(0, maps.shape[:2]), visible
+
+    if problem.statistic == "dot":
+        return products
+    return {"sweep": swept, "reduce": reduced}.get(problem.operator, lifted)
+
+
+def mode_of(scene: Scene) -> str:
+    """The library's name of a mode."""
+    smooth = "trilinear" if scene.problem.is_sweep else "bilinear"
+    return {"smooth": smooth, "nearest": "nearest"}[scene.problem.mode]
+
+
+def kernel(scene: Scene) -> dict[str, Callable[[], Any]]:
+    """The CPU kernel alone, forward, and with backward to the source: sites made beforehand, memory that is in use."""
+    problem, source = scene.problem, scene.source
+    if problem.device != "cpu" or problem.operator == "reduce" or problem.statistic == "dot":
+        raise LeftOut("not one call of a kernel")
+    reduce, is_sweep = problem.statistic or None, problem.is_sweep
+    options = Options.checked("benchmark", volume=is_sweep, mode=mode_of(scene), reduce=reduce)
+    options = replace(options, stacked=problem.flatten)
+    if reason := cpu.why_not("plane_sweep_project" if is_sweep else "unproject", source, options):
+        raise LeftOut(reason)
+    if is_sweep:
+        where = scene.cameras, scene.grid, scene.depths, (problem.size,) * 2
+        sites = sweep_sites("benchmark", source, *where, None, options)
+        forward, backward, axis = cpu.volume, cpu.volume_backward, 1
+    else:
+        sites = image_sites("benchmark", source, scene.cameras, scene.grid, None, options)
+        forward, backward, axis = cpu.images, cpu.images_backward, 2
+    out, _ = forward(source, sites, options)
+    gradient = scene.cotangent(out)
+    into = channels_last(torch.zeros(source.shape), axis)
+
+    def both() -> tuple[Tensor, Tensor]:
+        forward(source, sites, options, out=out)
+        into.zero_()  # it adds to what is there
+        return out, backward(gradient, source, sites, options, (True, False, False, False), into=into)[0]
+
+    return {"forward": lambda: forward(source, sites, options, out=out)[0], "forward+backward": both}
+
+
+def floors(scene: Scene) -> dict[str, Callable[[], Any]]:
+    """Writing the output once: into fresh memory, by the library's page policy, and again and again into the same.
+
+    A large block goes back to the system when it is freed, so that whoever makes a fresh output pays for its page
+    faults.
+    """
+    shape = (scene.problem.result_bytes // 4,)
+    buffer = cpu.fresh(shape, torch.float32)
+    return {COLD: lambda: cpu.fresh(shape, torch.float32).fill_(1.0), WARM: lambda: buffer.fill_(1.0)}
+
+
 CONTENDERS: Mapping[str, Callable[[Scene], Run]] = {
-    OURS: ours.contender,
-    REFERENCE: partial(ours.contender, backend="reference"),
-    UNFUSED: ours.unfused,
+    OURS: ours,
+    REFERENCE: partial(ours, backend="reference"),
+    UNFUSED: partial(ours, fused=False),
     HAND: rivals.contender,
     COMPILED: compiled.contender,
     COMPILED_ANY: partial(compiled.contender, dynamic=True),
     AUTOMATIC: partial(compiled.contender, automatic=True),
-    WARPER: warps.depth_warper,
-    HOMOGRAPHY: warps.homographies,
+    WARPER: styles.depth_warper,
+    HOMOGRAPHY: styles.homographies,
     ATLAS: styles.running_mean,
     MVSNET: styles.variance_volume,
     DOT: styles.dot_volume,

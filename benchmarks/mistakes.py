@@ -13,41 +13,24 @@ import torch
 from lsmgeo import VoxelGrid
 from lsmgeo.data import Calibration, PosedImages, Voxels
 
-__all__ = ["plants"]
-
-
 HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+SHIFT = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
 
-
-def _inverted(pose: np.ndarray) -> np.ndarray:
-    """Camera-to-world taken for world-to-camera."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = pose[:3, :3].T
-    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return inverse
-
-
-def _opengl(pose: np.ndarray) -> np.ndarray:
-    """Cameras that look along -z with y up, taken for ones that look along z with y down."""
-    return HALF_TURN @ pose
-
-
-def _flipped(pose: np.ndarray) -> np.ndarray:
-    """Cameras and world of which y points the other way: a left-handed system taken for a right-handed one."""
-    return MIRROR @ pose @ MIRROR
-
-
-def _half_pixel(K: np.ndarray) -> np.ndarray:
-    """Half-integer pixel centres taken for integer ones."""
-    shift = np.zeros((3, 3))
-    shift[:2, 2] = 0.5
-    return K + shift
-
-
-def _other_resolution(K: np.ndarray) -> np.ndarray:
-    """K of pictures half as large."""
-    return np.diag([0.5, 0.5, 1.0]) @ K
+POSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    # Camera-to-world taken for world-to-camera.
+    "poses inverted": np.linalg.inv,
+    # Cameras that look along -z with y up, taken for ones that look along z with y down.
+    "OpenGL axes": lambda pose: HALF_TURN @ pose,
+    # Cameras and world of which y points the other way: a left-handed system taken for a right-handed one.
+    "y flipped": lambda pose: MIRROR @ pose @ MIRROR,
+}
+INTRINSICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    # Half-integer pixel centres taken for integer ones.
+    "half a pixel": lambda K: K + SHIFT,
+    # K of pictures half as large.
+    "K of another resolution": lambda K: np.diag([0.5, 0.5, 1.0]) @ K,
+}
 
 
 def _another(count: int) -> np.ndarray:
@@ -57,10 +40,6 @@ def _another(count: int) -> np.ndarray:
     while count >= 4 and (order == np.arange(count)).any():
         order = rng.permutation(count)
     return order
-
-
-POSES = {"poses inverted": _inverted, "OpenGL axes": _opengl, "y flipped": _flipped}
-INTRINSICS = {"half a pixel": _half_pixel, "K of another resolution": _other_resolution}
 
 
 def plants(content: Any) -> dict[str, Callable[[], Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,14 +12,11 @@ from torch import Tensor
 
 from lsmgeo import FrustumGrid, VoxelGrid, cameras, depth_planes
 
-__all__ = ["LAYOUTS", "LeftOut", "Problem", "Run", "Scene"]
-
 # From a source, a leaf or not, to what is compared: an output, and who sees what or None.
 Run = Callable[[Tensor], tuple[Tensor, Tensor | None]]
 
 IMAGE = 224  # pixels of the photographs; feature maps and swept maps are smaller
-LAYOUTS = ("channels_last", "contiguous")
-EXTENT = (1.0, 3.0)  # depths of the planes, the cameras being 2 from a cube of side 1
+TINY = {"B": 2, "V": 2, "C": 8, "size": 16, "voxels": 8, "planes": 4, "outputs": 8}
 
 
 class LeftOut(Exception):
@@ -44,7 +41,7 @@ class Problem:
         flatten: whether a sweep stacks its planes into the channels.
         outputs: channels of the linear map.
         dtype: of the source.
-        layout: of the source in memory.
+        layout: of the source in memory, "channels_last" or "contiguous".
         device: "cpu" or "cuda".
     """
 
@@ -65,9 +62,6 @@ class Problem:
 
     def but(self, **changes: Any) -> Problem:
         return replace(self, **changes)
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
     @property
     def is_sweep(self) -> bool:
@@ -130,39 +124,32 @@ class Scene:
     @cached_property
     def source(self) -> Tensor:
         """Features (B, V, C, size, size), or a volume (B, C, voxels, voxels, voxels)."""
-        problem = self.problem
-        if problem.is_sweep:
-            made = _random((problem.B, problem.C, *(problem.voxels,) * 3), 1)
-        else:
-            made = _random((problem.B, problem.V, problem.C, problem.size, problem.size), 1)
-        if problem.layout == "channels_last":
-            made = channels_last(made, 1 if problem.is_sweep else 2)
+        problem, axis = self.problem, 1 if self.problem.is_sweep else 2
+        sides = (problem.voxels,) * 3 if problem.is_sweep else (problem.size,) * 2
+        made = _random((*(problem.B, problem.V)[:axis], problem.C, *sides), 1)
+        made = channels_last(made, axis) if problem.layout == "channels_last" else made
         return made.to(problem.device, problem.torch_dtype)
 
     @cached_property
     def grid(self) -> VoxelGrid | FrustumGrid:
-        problem = self.problem
-        if problem.operator != "frustum":
-            return VoxelGrid(problem.voxels)
-        side = problem.frustum_size
-        return FrustumGrid(self.frustum_camera, self.depths, size=(side, side))
-
-    @cached_property
-    def frustum_camera(self) -> cameras.CameraTensors:
-        """The central half of the first view: its pixels are those of the feature map, moved by `frustum_offset`."""
-        quarter = IMAGE // 4
-        return cameras.crop(cameras.select(self.cameras, 1, 0), quarter, quarter, IMAGE // 2, IMAGE // 2)
+        """Voxels, or the frustum of the central half of the first view: `window` of its feature map's pixels."""
+        if self.problem.operator != "frustum":
+            return VoxelGrid(self.problem.voxels)
+        quarter, size = IMAGE // 4, (self.problem.frustum_size,) * 2
+        camera = cameras.crop(cameras.select(self.cameras, 1, 0), quarter, quarter, IMAGE // 2, IMAGE // 2)
+        return FrustumGrid(camera, self.depths, size=size)
 
     @property
-    def frustum_offset(self) -> int:
-        return self.problem.size // 4
+    def window(self) -> slice:
+        """The rows, and columns, of the first feature map that a frustum takes."""
+        return slice(self.problem.size // 4, self.problem.size // 4 + self.problem.frustum_size)
 
     @cached_property
     def depths(self) -> Tensor:
         problem = self.problem
-        near, far = (1.75, 2.25) if problem.operator == "frustum" else EXTENT
-        spacing = "inverse" if problem.operator == "frustum" else "depth"
-        return depth_planes(near, far, problem.planes, spacing=spacing).to(problem.device)
+        if problem.operator == "frustum":
+            return depth_planes(1.75, 2.25, problem.planes, spacing="inverse").to(problem.device)
+        return depth_planes(1.0, 3.0, problem.planes).to(problem.device)  # the cameras are 2 from a cube of side 1
 
     @cached_property
     def weight(self) -> Tensor:

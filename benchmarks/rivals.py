@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d, grid_sample
+from torch.nn.functional import grid_sample
 
 from benchmarks.problems import IMAGE, LeftOut, Run, Scene
 
@@ -61,41 +61,36 @@ STATISTICS = {"mean": view_mean, "variance": view_variance}
 
 
 def plane_sweep_project(
-    volume: Tensor,
-    K: Tensor,
-    E: Tensor,
-    depths: Tensor,
-    image: tuple[int, int],
-    size: tuple[int, int],
-    lower: float,
-    upper: float,
-    mode: str = "smooth",
+    volume: Tensor, K: Tensor, E: Tensor, depths: Tensor, image: tuple[int, int], size: tuple[int, int], mode: str
 ) -> tuple[Tensor, Tensor]:
-    """A volume (B, C, D, H, W) over a cube along the rays of (B, V) cameras: maps (B, V, C, P, h, w) and visibility."""
+    """A volume (B, C, D, H, W) over the cube of side 1 along the rays of (B, V) cameras.
+
+    Returns:
+        Maps (B, V, C, P, h, w) and visibility.
+    """
     B, V = K.shape[:2]
-    h, w = size
+    sites = (len(depths), *size)
     front = (depths > NEAR)[:, None]
-    points = sweep_points(K, E, depths, image, size)  # (B, V, P, h w, 3)
-    coordinates = (points - lower) * (2.0 / (upper - lower)) - 1.0  # cell edges at -1 and 1, as grid_sample has them
+    center, rays = pixel_rays(K, E, image, size)
+    points = center[:, :, None, None] + depths[:, None, None] * rays[:, :, None]  # (B, V, P, h w, 3)
+    coordinates = 2.0 * points  # cell edges at -1 and 1, as grid_sample has them
     visible = front & ((coordinates >= -1.0) & (coordinates < 1.0)).all(-1)
     source = volume.float()[:, None].expand(B, V, *volume.shape[1:]).flatten(0, 1)
-    coordinates = coordinates.reshape(B * V, len(depths), h, w, 3)
-    values = grid_sample(source, coordinates, mode=MODES[mode], align_corners=False)
-    values = torch.where(front[..., None], values.reshape(B, V, -1, len(depths), h, w), 0.0).to(volume.dtype)
-    return values, visible.reshape(B, V, len(depths), h, w)
+    values = grid_sample(source, coordinates.reshape(B * V, *sites, 3), mode=MODES[mode], align_corners=False)
+    values = torch.where(front[..., None], values.reshape(B, V, -1, *sites), 0.0).to(volume.dtype)
+    return values, visible.reshape(B, V, *sites)
 
 
-def sweep_points(K: Tensor, E: Tensor, depths: Tensor, image: tuple[int, int], size: tuple[int, int]) -> Tensor:
-    """World points (B, V, P, h w, 3) of every pixel at every depth."""
-    h, w = size
-    axes = (torch.arange(n, dtype=K.dtype, device=K.device) for n in (h, w))
-    v, u = torch.meshgrid(*axes, indexing="ij")
+def pixel_rays(K: Tensor, E: Tensor, image: tuple[int, int], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Camera centres (..., 3), and directions (..., h w, 3) of pixels' rays, of camera z = 1."""
+    v, u = torch.meshgrid(*(torch.arange(n, dtype=K.dtype, device=K.device) for n in size), indexing="ij")
     pixels = torch.stack((u, v, torch.ones_like(u)), -1).reshape(-1, 3)
-    rotation, translation = E[..., :3, :3], E[..., :3, 3]
-    to_world = rotation.transpose(-1, -2) @ torch.linalg.inv(feature_intrinsics(K, image, size))
-    rays = pixels @ to_world.transpose(-1, -2)  # (B, V, h w, 3)
-    center = -(rotation.transpose(-1, -2) @ translation[..., None])[..., 0]
-    return center[:, :, None, None] + depths[:, None, None] * rays[:, :, None]
+    to_world = E[..., :3, :3].transpose(-1, -2) @ torch.linalg.inv(feature_intrinsics(K, image, size))
+    return camera_centers(E), pixels @ to_world.transpose(-1, -2)
+
+
+def camera_centers(E: Tensor) -> Tensor:
+    return -(E[..., :3, :3].transpose(-1, -2) @ E[..., :3, 3:])[..., 0]
 
 
 def contender(scene: Scene) -> Run:
@@ -103,7 +98,7 @@ def contender(scene: Scene) -> Run:
     problem = scene.problem
     K, E = scene.cameras.intrinsics, scene.cameras.cam_from_world
     image, size = (IMAGE, IMAGE), (problem.size, problem.size)
-    if problem.statistic not in ("", *STATISTICS):
+    if problem.operator == "reduce" or problem.statistic not in ("", *STATISTICS):
         raise LeftOut("not written")
 
     def lifted(features: Tensor) -> tuple[Tensor, Tensor]:
@@ -111,12 +106,7 @@ def contender(scene: Scene) -> Run:
         return STATISTICS[problem.statistic](volume, visible) if problem.statistic else volume, visible
 
     def swept(volume: Tensor) -> tuple[Tensor, Tensor]:
-        maps, visible = plane_sweep_project(volume, K, E, scene.depths, image, size, -0.5, 0.5, problem.mode)
-        return maps.flatten(2, 3) if problem.flatten or problem.operator == "reduce" else maps, visible
+        maps, visible = plane_sweep_project(volume, K, E, scene.depths, image, size, problem.mode)
+        return maps.flatten(2, 3) if problem.flatten else maps, visible
 
-    def reduced(volume: Tensor) -> tuple[Tensor, Tensor]:
-        maps, visible = swept(volume)
-        mapped = conv2d(maps.flatten(0, 1), scene.weight[..., None, None])
-        return mapped.unflatten(0, maps.shape[:2]), visible
-
-    return {"sweep": swept, "reduce": reduced}.get(problem.operator, lifted)
+    return swept if problem.operator == "sweep" else lifted

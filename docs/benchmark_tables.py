@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +19,6 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import report  # noqa: E402
 
-TABLES: dict[str, Callable[[list[dict[str, Any]]], report.Rows]] = {
-    "goals": report.goal_rows,
-    "times": lambda cases: report.time_rows([case for case in cases if case.get("times")]),
-    "memory": lambda cases: report.memory_rows([case for case in cases if "memory" in case]),
-    "compiling": report.first_call_rows,
-    "left-out": report.left_out_rows,
-    "rates": lambda cases: report.rate_rows([case for case in cases if "rate" in case]),
-    "figures": report.figure_rows,
-    "mistakes": report.mistake_rows,
-    "reached": report.reached_rows,
-    "models": report.model_rows,
-}
 # The run whose curve of training is drawn.
 CURVE = "experiments/vlsm_45"
 # Figures of the plot directive, and the results that they draw.
@@ -65,7 +52,7 @@ class Benchmark(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         name = self.arguments[0]
-        kind = directives.choice(self.arguments[1], (*TABLES, "machine"))
+        kind = directives.choice(self.arguments[1], (*report.TABLES, "machine"))
         found = load(name)
         self.env.note_dependency(str(RESULTS / f"{name}.json"))
         if found is None:
@@ -73,7 +60,7 @@ class Benchmark(SphinxDirective):
         elif kind == "machine":
             lines = [report.machine_line(found["machine"])]
         else:
-            rows = TABLES[kind](found["cases"])
+            rows = report.TABLES[kind](found["cases"])
             lines = list_table(rows) if len(rows) > 1 else ["None."]
         return self.parse_text_to_nodes(StringList(lines, source=f"{name}.json"))
 

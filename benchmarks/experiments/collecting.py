@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import lsmgeo.models
-from benchmarks import timing
+from benchmarks import measuring
 from benchmarks.experiments.queue import ALL, SET, SHAPES, Experiment
 from benchmarks.experiments.running import EVALUATION, RECIPE, WEIGHTS, Folder
 from lsmgeo.data import write_atomic
 
 __all__ = ["PRETRAINED", "RESULTS", "collect", "headline"]
 
-RESULTS = timing.RESULTS / "experiments"
+RESULTS = measuring.RESULTS / "experiments"
 PRETRAINED = Path(lsmgeo.models.__file__).parent / "pretrained"
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from benchmarks import timing
+from benchmarks import measuring
 from benchmarks.experiments.queue import SET, SHAPES, Experiment
 from lsmgeo.data import Batch, ShardSet, render_set, write_atomic
 from lsmgeo.errors import OptionError
@@ -89,7 +89,7 @@ def run_experiment(experiment: Experiment, folder: Folder) -> int:
         model, validation["by precision"] = ship(experiment, model, path, folder)
     content = {
         "set": digest,
-        "machine": timing.machine("cpu"),
+        "machine": measuring.machine(),
         "parameters": sum(parameter.numel() for parameter in model.parameters()),
         "validation": validation,
         "evaluation": evaluate_test(experiment, model, validation, folder) if experiment.is_tested else {},
@@ -143,32 +143,28 @@ def evaluate_test(experiment: Experiment, model: Model, validation: dict[str, An
     threshold = float(max(by_threshold, key=lambda level: by_threshold[level]))
     method = evaluation.Contender(model.name, model)
     options = evaluation.Options(threshold=threshold, progress=True)
-    report = evaluation.evaluate([method], shapes, "iou", replace(options, views=VIEWS))
-    rows = {row.name: row for row in report.tables[0].rows if not row.is_elsewhere}
+    iou, categories = evaluation.evaluate([method], shapes, "iou", replace(options, views=VIEWS)).tables[:2]
+    rows = [row for row in iou.rows if not row.is_elsewhere]
     fewer = evaluation.open_shapes(folder.set, size=model.image_size, shapes=FEW_SHAPES * CATEGORIES)
     return {
         "data": about,
         "threshold": threshold,
-        "iou": {name: [round(cell.value, 3) for cell in row.cells] for name, row in rows.items()},
-        "standard_errors": {name: [round(cell.error, 3) for cell in row.cells] for name, row in rows.items()},
-        "categories": {
-            row.name: dict(zip(report.tables[1].columns, [round(cell.value, 3) for cell in row.cells], strict=True))
-            for row in report.tables[1].rows
-            if not row.is_elsewhere
-        },
+        "iou": {row.name: [round(cell.value, 3) for cell in row.cells] for row in rows},
+        "standard_errors": {row.name: [round(cell.error, 3) for cell in row.cells] for row in rows},
+        "categories": numbers(categories),
         "reports": {
-            name: {
-                table.title: {
-                    row.name: dict(
-                        zip(table.columns, [cell and round(cell.value, 3) for cell in row.cells], strict=True)
-                    )
-                    for row in table.rows
-                    if not row.is_elsewhere
-                }
-                for table in evaluation.evaluate([method], fewer, name, options).tables
-            }
+            name: {table.title: numbers(table) for table in evaluation.evaluate([method], fewer, name, options).tables}
             for name in experiment.reports
         },
+    }
+
+
+def numbers(table: Any) -> dict[str, dict[str, float | None]]:
+    """The numbers of a table that were measured here, by row and column."""
+    return {
+        row.name: dict(zip(table.columns, [cell and round(cell.value, 3) for cell in row.cells], strict=True))
+        for row in table.rows
+        if not row.is_elsewhere
     }
 
 

@@ -1,0 +1,184 @@
+"""Time, peak memory, where they were measured, and the file that keeps them."""
+
+from __future__ import annotations
+
+import ctypes
+import datetime
+import gc
+import json
+import multiprocessing
+import os
+import platform
+import statistics
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.benchmark import timer
+
+RESULTS = Path(__file__).parent / "results"
+FEWEST, MOST = 5, 31
+STATUS, REFERENCES = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to run.
+
+    Args:
+        quick: tiny sizes, few rounds, nothing compiled: whether everything works, not how fast.
+        repeats: rounds; None fills the time that each benchmark allows itself.
+        device: "cpu" or "cuda".
+        data: folder of the sets that cannot be distributed; None where there is none.
+        only: of a benchmark in several parts, those whose name holds this.
+    """
+
+    quick: bool = False
+    repeats: int | None = None
+    device: str = "cpu"
+    data: Path | None = None
+    only: str = ""
+
+
+def interleaved(
+    runs: Mapping[str, Callable[[], Any]],
+    repeats: int | None = None,
+    warm_up: int = 1,
+    budget: float = 10.0,
+    fewest: int = FEWEST,
+) -> dict[str, list[float]]:
+    """Seconds of each run: one after another in turn, so that a busy moment meets all alike; the order alternates.
+
+    Without `repeats` there are as many rounds as fit into `budget` seconds, between `fewest` and `MOST`. The clock
+    waits for a GPU.
+    """
+    order, taken = list(runs), {name: list[float]() for name in runs}
+
+    def turn() -> float:
+        order.reverse()
+        for name in order:
+            start = timer()
+            result = runs[name]()
+            del result  # giving its memory back is part of the call
+            taken[name].append(timer() - start)
+        return sum(seconds[-1] for seconds in taken.values())
+
+    spent = [turn() for _ in range(warm_up)]
+    if repeats is None:
+        repeats = min(MOST, max(fewest, int(budget / max(spent[-1], 1e-6))))
+    for _ in range(repeats):
+        turn()
+    return {name: seconds[warm_up:] for name, seconds in taken.items()}
+
+
+def spread(seconds: list[float]) -> dict[str, Any]:
+    """Median and quartiles, in milliseconds."""
+    quartiles = statistics.quantiles(seconds, n=4) if len(seconds) > 1 else 3 * seconds
+    low, middle, high = (1e3 * value for value in quartiles)
+    return {"median_ms": middle, "quartiles_ms": [low, high], "rounds": len(seconds)}
+
+
+def rate(case: str, unit: str, rates: Iterable[float], target: float | None = None) -> dict[str, Any]:
+    """A case of something done so many times a second, in several rounds."""
+    found = sorted(rates)
+    middle = statistics.median(found)
+    return {"case": case, "unit": unit, "rate": middle, "slowest": found[0], "fastest": found[-1], "target": target}
+
+
+def can_measure(device: str = "cpu") -> bool:
+    """Whether this system tells the peak of a process."""
+    return device == "cuda" or (STATUS.is_file() and os.access(REFERENCES, os.W_OK))
+
+
+def peak(run: Callable[[], Any], device: str = "cpu") -> int:
+    """Bytes that a call takes at its peak above those in use before it.
+
+    PyTorch counts on a GPU. Linux keeps the high-water mark of a process's resident memory (VmHWM) and sets it back on
+    request.
+    """
+    run()  # pools, caches and code of the first call are not counted
+    gc.collect()
+    if device == "cuda":
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        run()
+        torch.cuda.synchronize()
+        return torch.cuda.max_memory_allocated() - before
+    if platform.libc_ver()[0] == "glibc":
+        ctypes.CDLL(None).malloc_trim(0)  # else freed blocks of the first call are used unseen
+    before = _status("VmRSS")
+    REFERENCES.write_text("5", encoding="ascii")
+    run()
+    return _status("VmHWM") - before
+
+
+def _status(key: str) -> int:
+    line = next(line for line in STATUS.read_text(encoding="ascii").splitlines() if line.startswith(key + ":"))
+    return int(line.split()[1]) * 1024
+
+
+def _answer(threads: int, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    torch.set_num_threads(threads)
+    return function(*arguments)
+
+
+def alone(function: Callable[..., Any], *arguments: Any, limit: float = 300.0) -> Any:
+    """What a function of a module answers in a process of its own, forked from one that has everything imported.
+
+    Raises:
+        multiprocessing.TimeoutError: not within `limit` seconds, or it ended without an answer.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["benchmarks.comparing"])
+    with context.Pool(1) as pool:
+        return pool.apply_async(_answer, (torch.get_num_threads(), function, arguments)).get(limit)
+
+
+def processor() -> str:
+    """The name of the processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def huge_pages() -> str:
+    """When the system gives huge pages: "always", "madvise", "never", or "unknown"."""
+    try:
+        text = Path("/sys/kernel/mm/transparent_hugepage/enabled").read_text(encoding="ascii")
+        return text.split("[")[1].split("]")[0]
+    except (OSError, IndexError):
+        return "unknown"
+
+
+def machine(device: str = "cpu") -> dict[str, Any]:
+    """Where and when something was measured."""
+    import kornia
+
+    import lsmgeo
+
+    return {
+        "device": torch.cuda.get_device_name() if device == "cuda" else processor(),
+        "vector_instructions": torch.backends.cpu.get_cpu_capability(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "huge_pages": huge_pages(),
+        "load_before": os.getloadavg()[0],
+        "system": f"{platform.system()} {platform.release()}",
+        "lsmgeo": lsmgeo.__version__,
+        "torch": torch.__version__,
+        "kornia": kornia.__version__,
+        "python": platform.python_version(),
+        "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d"),
+    }
+
+
+def save(path: Path, where: Mapping[str, Any], cases: list[dict[str, Any]]) -> None:
+    """Write results as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps({"machine": where, "cases": cases}, indent=1, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8")

@@ -28,7 +28,7 @@ from lsmgeo.cameras import CameraTensors, resize, select, stack
 from lsmgeo.classical import Reconstruction, hull_box, reconstruct_scene, silhouettes, visual_hull
 from lsmgeo.classical.tsdf import voxel_side
 
-Section = tuple[list[dict[str, Any]], dict[str, Any]]  # rows of the table, and the numbers that curves are drawn from
+Section = dict[str, Any]  # rows of the table, and the numbers that curves are drawn from
 
 
 def found_in(one: Reconstruction) -> Found:
@@ -107,7 +107,7 @@ def stereo(root: Path) -> Section:
     fewer = sum(bad_at(ours, true, level, THRESHOLD) < bad_at(plain, true, level, THRESHOLD) for level in DENSITIES)
     what = "densities of 10 at which ours has fewer bad pixels than plain ZNCC"
     rows.append(row("motorcycle", what, str(fewer), "all 10", fewer == 10))
-    return rows, {"bad_pixel_curves": curves, "threshold_px": THRESHOLD}
+    return {"rows": rows, "bad_pixel_curves": curves, "threshold_px": THRESHOLD}
 
 
 WALK_DENSITIES = (0.1, 0.2, 0.4)
@@ -151,7 +151,7 @@ def rgbd(root: Path) -> Section:
     what = f"frames of {frames} whose error at 40 % density is at most half of plain ZNCC's"
     measured = f"{int((ratios <= 0.5).sum())}, largest ratio {ratios.max():.2f}"
     rows.append(row("HoloLens", what, measured, "all", (ratios <= 0.5).all()))
-    return rows, {"median_errors": {name: each.tolist() for name, each in found.items()}, "densities": WALK_DENSITIES}
+    return {"rows": rows}
 
 
 POSED = {"fountain": "strecha_fountain_quarter", "temple": "middlebury_temple", "COLMAP scene": "colmap_scene"}
@@ -187,7 +187,7 @@ def errors_at(one: Reconstruction, truth: Depths, full: tuple[int, int], density
 
 def posed(root: Path) -> Section:
     """Photographs with known cameras and no depth, against triangulated features, and against sparse points."""
-    rows, figures = [], {}
+    rows = []
     for name, folder in POSED.items():
         scene = data.open(root / folder)
         views, among = (list(range(min(count, len(scene)))) for count in (VIEWS, VIEWS_MATCHED))
@@ -196,15 +196,12 @@ def posed(root: Path) -> Section:
         if scene.points is not None:
             truths["the set's sparse points"] = [sparse_of(scene, view) for view in views]
         for kind, depths in truths.items():
-            errors = [
-                errors_at(one, truth, scene.size(one.view), 0.4) for one, truth in zip(judged, depths, strict=True)
-            ]
-            pooled = np.concatenate(errors)
+            pairs = zip(judged, depths, strict=True)
+            pooled = np.concatenate([errors_at(one, truth, scene.size(one.view), 0.4) for one, truth in pairs])
             median, tenth = 100 * float(np.median(pooled)), 100 * float(np.quantile(pooled, 0.9))
             what = f"median depth error at 40 % density against {len(pooled)} {kind} in {len(views)} views"
             rows.append(row(name, what, f"{median:.2f} %, 90 % below {tenth:.1f} %", "at most 0.5 %", median <= 0.5))
-            figures.setdefault(name, {})[kind] = [float(np.median(one)) for one in errors]
-    return rows, {"median_errors": figures}
+    return {"rows": rows}
 
 
 # The box of the temple as the publisher states it, metres.
@@ -248,7 +245,7 @@ def temple(root: Path) -> Section:
         rows.append(row(title, what, measured, goals[0], np.mean(scores) >= 0.88))
         what, far = f"{name}: its box from the published one, six faces", np.abs(away).max()
         rows.append(row(title, what, f"most {far:.1f} mm (lower {lower}; upper {upper})", goals[1], far <= 20))
-    return rows, {}
+    return {"rows": rows}
 
 
 # What needs the folder of sets, and what does not.
@@ -268,7 +265,7 @@ def measure(settings: Settings) -> list[dict[str, Any]]:
         if settings.only in name:
             start = time.perf_counter()
             is_here = name in PHOTOGRAPHS and settings.data is not None
-            rows, figures = PHOTOGRAPHS[name](settings.data) if is_here else ([], {})
-            rows += EXACT[name]() if name in EXACT else []
-            cases.append({"section": name, "seconds": time.perf_counter() - start, "rows": rows, **figures})
+            case = {"section": name, **(PHOTOGRAPHS[name](settings.data) if is_here else {"rows": []})}
+            case["rows"] += EXACT[name]() if name in EXACT else []
+            cases.append({**case, "seconds": time.perf_counter() - start})
     return cases

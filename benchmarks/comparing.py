@@ -65,7 +65,7 @@ def differentiate(run: Run, inputs: list[Tensor], cotangent: Tensor) -> tuple[Te
     return output, visible, list(torch.autograd.grad(output, inputs, cotangent))
 
 
-def check(scene: Scene, runs: Mapping[str, Run], backward: bool = True) -> tuple[dict[str, Tensor], dict[str, float]]:
+def check(scene: Scene, runs: Mapping[str, Run]) -> tuple[dict[str, Tensor], dict[str, float]]:
     """Compare all with the reference.
 
     Returns:
@@ -78,7 +78,7 @@ def check(scene: Scene, runs: Mapping[str, Run], backward: bool = True) -> tuple
     limit, inputs, reference = tolerance(scene.problem), leaves(scene), who.ours(scene, "reference")
     expected, expected_visible = forward(reference, inputs)
     cotangent = scene.cotangent(expected)
-    expected_gradients = differentiate(reference, inputs, cotangent)[2] if backward else []
+    expected_gradients = differentiate(reference, inputs, cotangent)[2]
     cotangents, first = {}, {}
     for name, run in runs.items():
         start = time.perf_counter()
@@ -91,12 +91,11 @@ def check(scene: Scene, runs: Mapping[str, Run], backward: bool = True) -> tuple
                 raise Different(f"{name}: visibility differs at a share of {share:.1e} of the samples")
         cotangents[name] = torch.empty_like(output).copy_(cotangent)
         del output, visible
-        if backward:
-            start = time.perf_counter()
-            gradients = differentiate(run, inputs, cotangents[name])[2]
-            first[name] += time.perf_counter() - start
-            for gradient, expected_gradient in zip(gradients, expected_gradients, strict=True):
-                compare(f"{name}: gradient", gradient, expected_gradient, limit)
+        start = time.perf_counter()
+        gradients = differentiate(run, inputs, cotangents[name])[2]
+        first[name] += time.perf_counter() - start
+        for gradient, expected_gradient in zip(gradients, expected_gradients, strict=True):
+            compare(f"{name}: gradient", gradient, expected_gradient, limit)
     return cotangents, first
 
 
@@ -139,7 +138,7 @@ def timings(
         if kernel:
             turns[who.KERNEL] = kernel[kind]
         if floors and kind == FORWARD:
-            turns |= who.floors(scene)
+            turns |= who.floors(next(iter(cotangents.values())).nbytes)
         seconds = measuring.interleaved(turns, settings.repeats, budget=budget, fewest=fewest)
         cases.append(
             {

@@ -105,13 +105,13 @@ def kernel(scene: Scene) -> dict[str, Callable[[], Any]]:
     return {"forward": lambda: forward(source, sites, options, out=out)[0], "forward+backward": both}
 
 
-def floors(scene: Scene) -> dict[str, Callable[[], Any]]:
-    """Writing the output once: into fresh memory, by the library's page policy, and again and again into the same.
+def floors(count: int) -> dict[str, Callable[[], Any]]:
+    """Writing so many bytes: into fresh memory, by the library's page policy, and again and again into the same.
 
     A large block goes back to the system when it is freed, so that whoever makes a fresh output pays for its page
     faults.
     """
-    shape = (scene.problem.result_bytes // 4,)
+    shape = (count // 4,)
     buffer = cpu.fresh(shape, torch.float32)
     return {COLD: lambda: cpu.fresh(shape, torch.float32).fill_(1.0), WARM: lambda: buffer.fill_(1.0)}
 

@@ -10,9 +10,9 @@ import torch
 
 from benchmarks import contenders as who
 from benchmarks import measuring, report
-from benchmarks.comparing import BOTH, FORWARD, KINDS, memory, ratio, sized, taking_part, timings
+from benchmarks.comparing import BOTH, FORWARD, KINDS, memory, ratio, taking_part, timings
 from benchmarks.measuring import Settings
-from benchmarks.problems import Problem, Scene
+from benchmarks.problems import Problem
 
 UNPROJECT, SWEEP, FRUSTUM = Problem("unproject"), Problem("sweep", size=56), Problem("frustum", B=1)
 MEAN, VARIANCE = UNPROJECT.but(statistic="mean"), UNPROJECT.but(statistic="variance")
@@ -211,17 +211,17 @@ def gpu(settings: Settings) -> list[dict[str, Any]]:
     cases = []
     for label, problem, share in GPU:
         names = (who.OURS, who.HAND, who.COMPILED)
-        made = timings(label, problem, names, settings, budget=5.0)
+        made, taken = timings(label, problem, names, settings, budget=5.0), memory(problem, names, settings)
         for case in made:
             case["goals"] = [
                 report.goal(f"{name} : {who.OURS}", value, target, True, reason)
                 for name, target in ((who.HAND, 4.0), (who.COMPILED, 1.0))
                 for value, reason in [ratio(case, name, who.OURS)]
             ]
-            if share is not None and case["kind"] == FORWARD:
-                same = sized(problem, settings)
-                moved = 1e3 * (same.result_bytes + Scene(same).source.nbytes) / case["times"][who.OURS]["median_ms"]
-                case["goals"].append(report.goal("share of the copy's bandwidth", moved / bandwidth, share, True))
-        made[-1]["memory"] = memory(problem, names, settings)
+        if share is not None and "peak" in taken[who.OURS]:
+            moved = 1e3 * sum(taken[who.OURS][key] for key in ("inputs", "output"))
+            reached = moved / made[0]["times"][who.OURS]["median_ms"] / bandwidth
+            made[0]["goals"].append(report.goal("share of the copy's bandwidth", reached, share, True))
+        made[-1]["memory"] = taken
         cases += made
     return cases

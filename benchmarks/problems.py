@@ -25,40 +25,24 @@ class LeftOut(Exception):
 
 @dataclass(frozen=True)
 class Problem:
-    """Sizes and options.
+    """Sizes and options."""
 
-    Args:
-        operator: "unproject" (images to voxels), "sweep" (voxels to images), "reduce" (a sweep and a linear map of its
-            stacked channels) or "frustum" (images to the frustum of the first view).
-        B: scenes.
-        V: views of a scene.
-        C: channels.
-        size: side of the feature maps; of the maps for a sweep.
-        voxels: side of the grid.
-        planes: of a sweep or frustum.
-        mode: "smooth" or "nearest".
-        statistic: over the views; "" keeps them. "dot": the product with the first view, averaged over channels.
-        flatten: whether a sweep stacks its planes into the channels.
-        outputs: channels of the linear map.
-        dtype: of the source.
-        layout: of the source in memory, "channels_last" or "contiguous".
-        device: "cpu" or "cuda".
-    """
-
+    # "unproject" (images to voxels), "sweep" (voxels to images), "reduce" (a sweep and a linear map of its stacked
+    # channels) or "frustum" (images to the frustum of the first view).
     operator: str
-    B: int = 4
-    V: int = 4
-    C: int = 32
-    size: int = 112
-    voxels: int = 32
-    planes: int = 64
-    mode: str = "smooth"
-    statistic: str = ""
-    flatten: bool = False
-    outputs: int = 512
-    dtype: str = "float32"
-    layout: str = "channels_last"
-    device: str = "cpu"
+    B: int = 4  # scenes
+    V: int = 4  # views of a scene
+    C: int = 32  # channels
+    size: int = 112  # side of the feature maps; of the maps for a sweep
+    voxels: int = 32  # side of the grid
+    planes: int = 64  # of a sweep or frustum
+    mode: str = "smooth"  # or "nearest"
+    statistic: str = ""  # over the views; "" keeps them; "dot": the mean product with the first view
+    flatten: bool = False  # whether a sweep stacks its planes into the channels
+    outputs: int = 512  # channels of the linear map
+    dtype: str = "float32"  # of the source
+    layout: str = "channels_last"  # of the source in memory; or "contiguous"
+    device: str = "cpu"  # or "cuda"
 
     def but(self, **changes: Any) -> Problem:
         return replace(self, **changes)
@@ -80,16 +64,6 @@ class Problem:
     def frustum_size(self) -> int:
         """Side of a frustum's images: half of the features', so that other views see it whole; all of a sweep's."""
         return self.size // 2 if self.operator == "frustum" else self.size
-
-    @property
-    def result_bytes(self) -> int:
-        """Bytes of the output proper, without visibility."""
-        width = torch.finfo(self.torch_dtype).bits // 8
-        if self.operator == "reduce":
-            return width * self.B * self.V * self.outputs * self.size**2
-        if self.statistic == "dot":
-            return width * self.B * (self.V - 1) * self.sites
-        return width * self.B * (1 if self.statistic else self.V) * self.C * self.sites
 
 
 def channels_last(tensor: Tensor, axis: int) -> Tensor:

@@ -7,8 +7,6 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-__all__ = ["Depths", "Features", "find_features", "triangulate"]
-
 RATIO = 0.75
 MOST_EPIPOLAR, LEAST_ANGLE = 1.0, 2.0  # px, degrees
 
@@ -62,7 +60,9 @@ def triangulate(features: list[Features], K: np.ndarray, E: np.ndarray, referenc
     for first, found in seen.items():
         views = [reference, *(other for other, _ in found)]
         places = np.array([features[reference].pixels[first], *(pixel for _, pixel in found)])
-        point = _point(P[views], places)
+        rows = (places[:, :, None] * P[views, 2:] - P[views, :2]).reshape(-1, 4)
+        X = np.linalg.svd(rows / np.linalg.norm(rows, axis=1, keepdims=True))[2][-1]
+        point = X[:3] / X[3]
         image = P[views] @ np.append(point, 1.0)
         error = np.linalg.norm(image[:, :2] / image[:, 2:] - places, axis=1).max()
         rays = centers[views] - point
@@ -85,17 +85,7 @@ def _matches(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def _epipolar_error(a: np.ndarray, b: np.ndarray, K: Any, E: Any, first: int, second: int) -> float:
     """The larger distance in pixels of two places from each other's epipolar line."""
     relative = E[second] @ np.linalg.inv(E[first])
-    t = relative[:3, 3]
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    cross = np.cross(np.eye(3), relative[:3, 3]).T  # cross @ v is t x v
     F = np.linalg.inv(K[second]).T @ cross @ relative[:3, :3] @ np.linalg.inv(K[first])
     x, y = np.append(a, 1.0), np.append(b, 1.0)
-    line, line_other = F.T @ y, F @ x
-    return float(abs(y @ F @ x) / min(np.hypot(*line[:2]), np.hypot(*line_other[:2])))
-
-
-def _point(P: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    rows = np.concatenate([pixels[:, :1, None] * P[:, 2:] - P[:, :1], pixels[:, 1:, None] * P[:, 2:] - P[:, 1:2]], 1)
-    rows = rows.reshape(-1, 4)
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    X = np.linalg.svd(rows)[2][-1]
-    return X[:3] / X[3]
+    return float(abs(y @ F @ x) / min(np.hypot(*(F.T @ y)[:2]), np.hypot(*(F @ x)[:2])))

@@ -22,29 +22,17 @@ EVALUATION_MINUTES = {"voxels": 6.0, "depth": 8.0, "backgrounds": 1.5, "pose-noi
 
 @dataclass(frozen=True)
 class Experiment:
-    """One run.
+    """One run."""
 
-    Attributes:
-        name: of its folder and of its results.
-        what: what it is for, in words.
-        minutes: of CPU time, evaluation included.
-        model: the network, as `lsmgeo.models.create` knows it.
-        settings: what differs from the network's usual training, as "group.key".
-        preset: of the network.
-        reports: what else it is measured by, see ``lsmgeo evaluate``, on fewer test shapes.
-        ships: whether its weights become part of the package.
-        is_tested: whether its weights are measured on the test split; else only training measures them, on the
-            validation split.
-    """
-
-    name: str
-    what: str
-    minutes: float
-    model: str
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    preset: str = "standard"
-    reports: Sequence[str] = ()
-    ships: bool = False
+    name: str  # of its folder and of its results
+    what: str  # what it is for, in words
+    minutes: float  # of CPU time, evaluation included
+    model: str  # the network, as `lsmgeo.models.create` knows it
+    settings: Mapping[str, Any] = field(default_factory=dict)  # what differs from its usual training, as "group.key"
+    preset: str = "standard"  # of the network
+    reports: Sequence[str] = ()  # what else it is measured by, see ``lsmgeo evaluate``, on fewer test shapes
+    ships: bool = False  # whether its weights become part of the package
+    # Whether its weights are measured on the test split; else only training measures them, on the validation split.
     is_tested: bool = True
 
     @property
@@ -95,6 +83,7 @@ USUAL: Mapping[str, Mapping[str, Any]] = {
     "r2n2-pose": {"optimiser.learning_rate": 3e-4, "run.loss_views": "random"},
 }
 
+BACKGROUNDS, NOISE = {"data.background": "random"}, {"data.pose_noise": 10.0}
 FIRST, SECOND = {"data.categories": "first"}, {"data.categories": "second"}
 
 QUEUE = (
@@ -104,17 +93,8 @@ QUEUE = (
     Experiment("vlsm_90", "V-LSM, the weights of the package", 90, "voxel-lsm", reports=("order",), ships=True),
     Experiment("dlsm_90", "D-LSM, the weights of the package", 90, "depth-lsm", ships=True),
     Experiment("r2n2_45", "3D-R2N2", 45, "r2n2"),
-    Experiment(
-        "vlsm_bg_45",
-        "V-LSM on random backgrounds",
-        45,
-        "voxel-lsm",
-        {"data.background": "random"},
-        reports=("backgrounds",),
-    ),
-    Experiment(
-        "vlsm_noise_45", "V-LSM with pose noise", 45, "voxel-lsm", {"data.pose_noise": 10.0}, reports=("pose-noise",)
-    ),
+    Experiment("vlsm_bg_45", "V-LSM on random backgrounds", 45, "voxel-lsm", BACKGROUNDS, reports=("backgrounds",)),
+    Experiment("vlsm_noise_45", "V-LSM with pose noise", 45, "voxel-lsm", NOISE, reports=("pose-noise",)),
     Experiment("vlsm_first_45", "V-LSM on the first categories", 45, "voxel-lsm", FIRST),
     Experiment("vlsm_second_45", "V-LSM on the second categories", 45, "voxel-lsm", SECOND),
     Experiment("r2n2_pose_first_45", "3D-R2N2 with pose on the first categories", 45, "r2n2-pose", FIRST),
@@ -141,54 +121,29 @@ BEFORE = {
 
 WIDE = {"grid_channels": [64, 128], "feature_channels": 12, "hidden_channels": 48}
 
+EVERY, RANDOM = {"run.loss_views": "every"}, {"run.loss_views": "random"}
+SHORT = {"run.precision": "bf16", "run.cpu_minutes": None, "run.steps": 10, "run.evaluate_shapes": 4}
+CHANNELS = {"channels": [32, 64, 128, 192, 192], "hidden": 96, "decoder": [96, 48, 24]}
+V_BEFORE = {"model.settings": BEFORE, "run.loss": "bce", **EVERY}
+
 # What settings were chosen by, on the validation split; run by name.
 TRIALS = tuple(
     replace(trial, is_tested=False, preset="compact")
     for trial in (
-        Experiment(
-            "vlsm_before_5",
-            "V-LSM as it was before, in float32",
-            5,
-            "voxel-lsm",
-            {"model.settings": BEFORE, "run.loss": "bce", "run.loss_views": "every"},
-        ),
-        Experiment("vlsm_every_5", "V-LSM, the loss after every view", 5, "voxel-lsm", {"run.loss_views": "every"}),
-        Experiment(
-            "vlsm_bf16_5",
-            "V-LSM in bfloat16, ten steps",
-            5,
-            "voxel-lsm",
-            {"run.precision": "bf16", "run.cpu_minutes": None, "run.steps": 10, "run.evaluate_shapes": 4},
-        ),
+        Experiment("vlsm_before_5", "V-LSM as it was before, in float32", 5, "voxel-lsm", V_BEFORE),
+        Experiment("vlsm_every_5", "V-LSM, the loss after every view", 5, "voxel-lsm", EVERY),
+        Experiment("vlsm_bf16_5", "V-LSM in bfloat16, ten steps", 5, "voxel-lsm", SHORT),
         Experiment("vlsm_5", "V-LSM", 5, "voxel-lsm"),
         Experiment("vlsm_20", "V-LSM", 20, "voxel-lsm"),
         Experiment("vlsm_wide_20", "V-LSM, wider", 20, "voxel-lsm", {"model.settings": WIDE}),
-        Experiment(
-            "dlsm_before_10",
-            "D-LSM as it was before, in float32",
-            10,
-            "depth-lsm",
-            {"model.settings": BEFORE},
-        ),
+        Experiment("dlsm_before_10", "D-LSM as it was before, in float32", 10, "depth-lsm", {"model.settings": BEFORE}),
         Experiment("dlsm_10", "D-LSM", 10, "depth-lsm"),
-        Experiment(
-            "dlsm_random_10", "D-LSM, the loss after a random view", 10, "depth-lsm", {"run.loss_views": "random"}
-        ),
+        Experiment("dlsm_random_10", "D-LSM, the loss after a random view", 10, "depth-lsm", RANDOM),
         Experiment("r2n2_pose_8", "3D-R2N2 with pose", 8, "r2n2-pose"),
         Experiment("r2n2_pose_fast_8", "3D-R2N2 with pose, 1e-3", 8, "r2n2-pose", {"optimiser.learning_rate": 1e-3}),
+        Experiment("r2n2_pose_every_8", "3D-R2N2 with pose, the loss after every view", 8, "r2n2-pose", EVERY),
         Experiment(
-            "r2n2_pose_every_8",
-            "3D-R2N2 with pose, the loss after every view",
-            8,
-            "r2n2-pose",
-            {"run.loss_views": "every"},
-        ),
-        Experiment(
-            "r2n2_pose_channels_8",
-            "3D-R2N2 with pose, more channels",
-            8,
-            "r2n2-pose",
-            {"model.settings": {"channels": [32, 64, 128, 192, 192], "hidden": 96, "decoder": [96, 48, 24]}},
+            "r2n2_pose_channels_8", "3D-R2N2 with pose, more channels", 8, "r2n2-pose", {"model.settings": CHANNELS}
         ),
         Experiment("r2n2_pose_16", "3D-R2N2 with pose, twice as long", 16, "r2n2-pose"),
     )

@@ -22,35 +22,12 @@ from lsmgeo.cameras import CameraTensors
 from lsmgeo.classical import aggregate_views, matching_costs, sweep, sweep_planes
 from tests.classical import analytic
 
-# 5 x 5 blocks, the penalties that OpenCV's documentation gives for them, a uniqueness margin of 10 %, and both
-# directions within one pixel of each other.
-SEMI_GLOBAL = {
-    "minDisparity": 0,
-    "numDisparities": 64,
-    "blockSize": 5,
-    "P1": 8 * 5 * 5,
-    "P2": 32 * 5 * 5,
-    "disp12MaxDiff": 1,
-    "uniquenessRatio": 10,
-    "speckleWindowSize": 100,
-    "speckleRange": 2,
-    "mode": cv2.STEREO_SGBM_MODE_SGBM,
-}
 # A standard deviation that hardly counts; it was chosen among three for the lowest errors of the plain sweep.
 FAINT = 0.5 / 255
-LUMINANCE = (0.299, 0.587, 0.114)
 
 
 def row(section: str, what: str, measured: str, goal: str = "", reached: Any = None) -> dict[str, Any]:
-    """A line of the table.
-
-    Args:
-        section: what the figure is of: a set, or a part of the machine.
-        what: the figure, with its statistic and what it is taken over.
-        measured: with its unit.
-        goal: what it was to reach; empty where it is printed beside the others.
-        reached: whether it does; nothing where there is no goal.
-    """
+    """A line of the table: what of, the figure with its statistic, and the goal where there is one."""
     reached = bool(reached) if goal else None
     return {"section": section, "what": what, "measured": measured, "goal": goal, "reached": reached}
 
@@ -87,10 +64,16 @@ def matchers(left: np.ndarray, right: np.ndarray) -> dict[str, Found]:
     block = cv2.StereoBM_create(numDisparities=64, blockSize=15)  # type: ignore[attr-defined]
     block.setUniquenessRatio(10)
     block.setDisp12MaxDiff(1)
+    # 5 x 5 blocks, the penalties that OpenCV's documentation gives for them, a uniqueness margin of 10 %, and both
+    # directions within one pixel of each other.
+    semi_global = cv2.StereoSGBM_create(  # type: ignore[attr-defined]
+        minDisparity=0, numDisparities=64, blockSize=5, P1=8 * 5 * 5, P2=32 * 5 * 5, disp12MaxDiff=1,
+        uniquenessRatio=10, speckleWindowSize=100, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_SGBM,
+    )  # fmt: skip
     grey = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
-    semi_global = cv2.StereoSGBM_create(**SEMI_GLOBAL).compute(left, right)  # type: ignore[attr-defined]
+    computed = {"StereoSGBM": semi_global.compute(left, right), "StereoBM": block.compute(*grey)}
     found = {}
-    for name, sixteenths in (("StereoSGBM", semi_global), ("StereoBM", block.compute(*grey))):
+    for name, sixteenths in computed.items():
         disparity = np.where(sixteenths > 0, sixteenths / 16.0, np.nan)
         found[name] = Found(disparity, np.isfinite(disparity).astype(float))
     return found
@@ -98,7 +81,7 @@ def matchers(left: np.ndarray, right: np.ndarray) -> dict[str, Found]:
 
 def luminance(image: Any) -> np.ndarray:
     """(3, h, w) in [0, 1] to (h, w) float32."""
-    return np.einsum("chw,c->hw", np.asarray(image, np.float32), np.float32(LUMINANCE))
+    return np.einsum("chw,c->hw", np.asarray(image, np.float32), np.float32((0.299, 0.587, 0.114)))
 
 
 def moments(image: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -111,14 +94,8 @@ def moments(image: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.n
 def plain_sweep(images: Sequence[np.ndarray], cameras: Any, depths: np.ndarray, window: int = 5) -> Found:
     """The depth of the first view by the plainest plane sweep: mean ZNCC over the neighbours, the best plane wins.
 
-    Args:
-        images: (h, w) float32 luminances in [0, 1], the reference first.
-        cameras: their CameraTensors at that size, leading shape (V,).
-        depths: (P,) planes.
-        window: side of the square over which correlation is taken.
-
-    Returns:
-        Depths of planes, with the correlation as confidence.
+    Images are (h, w) float32 luminances in [0, 1], the reference first, cameras at their size. Depths are those of
+    planes, with the correlation as confidence.
     """
     best, winner = np.full(images[0].shape, -2.0, np.float32), np.full(images[0].shape, -1)
     matrices, offsets = relative(*(np.asarray(value, np.float64) for value in cameras[:2]))

@@ -125,6 +125,11 @@ def timings(
     if floors:
         try:
             kernel = who.kernel(scene)
+            output, gradient = kernel[BOTH]()
+            cotangent, limit = scene.cotangent(output).reshape(cotangents[who.OURS].shape), tolerance(problem)
+            expected, _, gradients = differentiate(runs[who.OURS], inputs, cotangent)
+            compare(f"{who.KERNEL}: values", output.reshape(expected.shape), expected, limit)
+            compare(f"{who.KERNEL}: gradient", gradient, gradients[0], limit)
         except LeftOut as reason:
             left_out[who.KERNEL] = str(reason)
     cases = []
@@ -201,11 +206,3 @@ def taken_by(problem: Problem, name: str, kind: str) -> dict[str, Any]:
     call = partial(forward, run, inputs) if kind == FORWARD else partial(differentiate, run, inputs, cotangent)
     peak = measuring.peak(call, problem.device)
     return {**kept, "inputs": size, "peak": peak, "above": peak - sum(kept.values())}
-
-
-def ratio(case: Mapping[str, Any], top: str, bottom: str) -> tuple[float | None, str]:
-    """Of two medians; or why there is none."""
-    for name in (top, bottom):
-        if name not in case["times"]:
-            return None, case["left_out"].get(name, f"{name} did not run")
-    return case["times"][top]["median_ms"] / case["times"][bottom]["median_ms"], ""

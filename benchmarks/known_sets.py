@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from benchmarks.measuring import Settings
@@ -41,9 +42,7 @@ def write_motorcycle(root: Path, scratch: Path) -> Path:
     with np.load(source / "motorcycle_disp.npz", allow_pickle=False) as arrays:
         disparity = arrays[arrays.files[0]].astype("<f4")
     height, width = disparity.shape
-    unknown = ~(np.isfinite(disparity) & (disparity > 0))
-    rows = np.where(unknown, np.float32(np.inf), disparity)[::-1]
-    (folder / "disp0.pfm").write_bytes(f"Pf\n{width} {height}\n-1.0\n".encode() + np.ascontiguousarray(rows).tobytes())
+    cv2.imwrite(str(folder / "disp0.pfm"), np.where(disparity > 0, disparity, np.float32(np.inf)))
     cameras = [
         f"cam{side}=[{FOCAL_LENGTH} 0 {CX + side * OFFSET:.3f}; 0 {FOCAL_LENGTH} {CY}; 0 0 1]" for side in (0, 1)
     ]

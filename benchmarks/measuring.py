@@ -25,21 +25,13 @@ STATUS, REFERENCES = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 @dataclass(frozen=True)
 class Settings:
-    """How to run.
+    """How to run."""
 
-    Args:
-        quick: tiny sizes, few rounds, nothing compiled: whether everything works, not how fast.
-        repeats: rounds; None fills the time that each benchmark allows itself.
-        device: "cpu" or "cuda".
-        data: folder of the sets that cannot be distributed; None where there is none.
-        only: of a benchmark in several parts, those whose name holds this.
-    """
-
-    quick: bool = False
-    repeats: int | None = None
-    device: str = "cpu"
-    data: Path | None = None
-    only: str = ""
+    quick: bool = False  # tiny sizes, few rounds, nothing compiled: whether everything works, not how fast
+    repeats: int | None = None  # rounds; None fills the time that each benchmark allows itself
+    device: str = "cpu"  # or "cuda"
+    data: Path | None = None  # folder of the sets that cannot be distributed; None where there is none
+    only: str = ""  # of a benchmark in several parts, those whose name holds this
 
 
 def interleaved(

@@ -43,14 +43,7 @@ def _another(count: int) -> np.ndarray:
 
 
 def plants(content: Any) -> dict[str, Callable[[], Any]]:
-    """What was read, with each of the mistakes that can be made with it.
-
-    Args:
-        content: posed photographs, voxels or a calibration.
-
-    Returns:
-        By name of the mistake, a call that gives the content with it.
-    """
+    """By name of each mistake that can be made with what was read, a call that gives the content with it."""
     if isinstance(content, PosedImages):
         made: dict[str, Callable[[], Any]] = {}
         for name, change in (POSES | INTRINSICS).items():

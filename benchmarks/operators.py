@@ -10,7 +10,7 @@ import torch
 
 from benchmarks import contenders as who
 from benchmarks import measuring, report
-from benchmarks.comparing import BOTH, FORWARD, KINDS, memory, ratio, taking_part, timings
+from benchmarks.comparing import BOTH, FORWARD, KINDS, memory, taking_part, timings
 from benchmarks.measuring import Settings
 from benchmarks.problems import Problem
 
@@ -36,20 +36,15 @@ REFERENCE_TARGETS = {FORWARD: 1.25, BOTH: 1.15}
 def goals(case: dict[str, Any], targets: tuple[float, float | None, float] | None) -> list[dict[str, Any]]:
     """What the library promises of a case."""
     hand, floor, kernel = targets or (None, None, None)
-    promised = [
+    reference = REFERENCE_TARGETS[case["kind"]] if who.REFERENCE in case["times"] else None
+    promised = (
         (who.COMPILED, who.OURS, 1.0, True),
         (who.HAND, who.OURS, hand, True),
         (who.OURS, who.COLD, floor, False),
         (who.HAND, who.KERNEL, kernel, True),
-    ]
-    if who.REFERENCE in case["times"]:
-        promised.append((who.REFERENCE, who.HAND, REFERENCE_TARGETS[case["kind"]], False))
-    found = []
-    for top, bottom, target, at_least in promised:
-        if target is not None:
-            value, reason = ratio(case, top, bottom)
-            found.append(report.goal(f"{top} : {bottom}", value, target, at_least, reason))
-    return found
+        (who.REFERENCE, who.HAND, reference, False),
+    )
+    return [report.ratio(case, top, bottom, aim, least) for top, bottom, aim, least in promised if aim is not None]
 
 
 def channels_last(settings: Settings) -> list[dict[str, Any]]:
@@ -106,17 +101,14 @@ def footprint(settings: Settings) -> list[dict[str, Any]]:
     label, left_out = f"128^3 voxels, 8 views, mean, {BOTH}", dict.fromkeys((who.HAND, who.COMPILED), reason)
     cases += [{"case": label, "memory": taken, "goals": met, "left_out": left_out, "times": {}}, *series]
 
-    both, label = Problem("reduce", size=56), "Sweep and 1x1 map, 32 x 64 to 512"
-    for case in timings(label, both, (who.OURS, who.UNFUSED), settings, budget=15.0):
-        case["memory"] = memory(both, (who.OURS, who.UNFUSED), settings, case["kind"])
+    both, label, names = Problem("reduce", size=56), "Sweep and 1x1 map, 32 x 64 to 512", (who.OURS, who.UNFUSED)
+    for case in timings(label, both, names, settings, budget=15.0):
+        case["memory"] = memory(both, names, settings, case["kind"])
         ours, apart = case["memory"].values()
         reason = ours.get("left_out", apart.get("left_out", ""))
         saved = None if reason else apart["above"] / max(ours["above"], 1)
-        what, time = "peak above inputs, outputs, gradients, unfused : fused", ratio(case, who.OURS, who.UNFUSED)[0]
-        case["goals"] = [
-            report.goal(what, saved, 10.0, True, reason),
-            report.goal("time, fused : unfused", time, 1.05, False),
-        ]
+        what, time = "peak above inputs, outputs, gradients, unfused : fused", report.ratio(case, *names, 1.05, False)
+        case["goals"] = [report.goal(what, saved, 10.0, True, reason), {**time, "goal": "time, fused : unfused"}]
         cases.append(case)
     return cases
 
@@ -213,11 +205,8 @@ def gpu(settings: Settings) -> list[dict[str, Any]]:
         names = (who.OURS, who.HAND, who.COMPILED)
         made, taken = timings(label, problem, names, settings, budget=5.0), memory(problem, names, settings)
         for case in made:
-            case["goals"] = [
-                report.goal(f"{name} : {who.OURS}", value, target, True, reason)
-                for name, target in ((who.HAND, 4.0), (who.COMPILED, 1.0))
-                for value, reason in [ratio(case, name, who.OURS)]
-            ]
+            rivals = (who.HAND, 4.0), (who.COMPILED, 1.0)
+            case["goals"] = [report.ratio(case, name, who.OURS, target) for name, target in rivals]
         if share is not None and "peak" in taken[who.OURS]:
             moved = 1e3 * sum(taken[who.OURS][key] for key in ("inputs", "output"))
             reached = moved / made[0]["times"][who.OURS]["median_ms"] / bandwidth

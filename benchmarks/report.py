@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from operator import truediv
 from typing import Any
 
 Rows = list[list[str]]
@@ -24,6 +25,16 @@ def goal(what: str, ratio: float | None, target: float, at_least: bool, reason: 
     met = None if ratio is None else ratio >= target if at_least else ratio <= target
     text = f"{'at least' if at_least else 'at most'} {target:g}"
     return {"goal": what, "ratio": ratio, "target": target, "target_text": text, "met": met, "reason": reason}
+
+
+def ratio(case: Mapping[str, Any], top: str, bottom: str, target: float, at_least: bool = True) -> dict[str, Any]:
+    """A line about the ratio of two medians; without one it says why."""
+    for name in (top, bottom):
+        if name not in case["times"]:
+            reason = case["left_out"].get(name, f"{name} did not run")
+            return goal(f"{top} : {bottom}", None, target, at_least, reason)
+    medians = (case["times"][name]["median_ms"] for name in (top, bottom))
+    return goal(f"{top} : {bottom}", truediv(*medians), target, at_least)
 
 
 def said(met: bool | None, word: str = "met") -> str:

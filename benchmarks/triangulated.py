@@ -39,12 +39,7 @@ def triangulate(features: list[Features], K: np.ndarray, E: np.ndarray, referenc
     A feature counts where its matches lie within a pixel of their epipolar lines, all of them within a pixel of the
     projection of one point, and where two views see that point under more than two degrees. The point is the linear
     least-squares solution (DLT; Hartley and Zisserman, Multiple View Geometry, section 12.2) over its views.
-
-    Args:
-        features: of all views.
-        K: (V, 3, 3).
-        E: (V, 4, 4) world-to-camera.
-        reference: the view whose depths are wanted.
+    K is (V, 3, 3), E (V, 4, 4) world-to-camera.
     """
     seen: dict[int, list[tuple[int, np.ndarray]]] = {}
     for other in range(len(features)):

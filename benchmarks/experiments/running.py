@@ -44,11 +44,7 @@ THRESHOLDS = (0.2, 0.3, 0.4, 0.5)
 
 
 class Folder:
-    """Where the set and the runs lie.
-
-    Args:
-        path: made if it is not there.
-    """
+    """Where the set and the runs lie; made if it is not there."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -65,10 +61,6 @@ class Folder:
 
 def run_experiment(experiment: Experiment, folder: Folder) -> int:
     """Train an experiment, or go on with it, then evaluate it; on one thread, at the lowest priority.
-
-    Args:
-        experiment: of the queue.
-        folder: of the set and the runs.
 
     Returns:
         The exit status: that of training where it was stopped.
@@ -103,11 +95,7 @@ def run_experiment(experiment: Experiment, folder: Folder) -> int:
 
 
 def make_set(folder: Folder) -> str:
-    """Render the set if it is missing, and compare it with the one that the results are about.
-
-    Returns:
-        The hash of its values.
-    """
+    """Render the set if it is missing, compare it with that of the results, and return the hash of its values."""
     marker = folder.set / "hash.json"
     if not marker.is_file():
         render_set("synthetic-13", folder.set, SET, shapes=SHAPES, per_shard=100, jobs=1, progress=True)
@@ -116,9 +104,8 @@ def make_set(folder: Folder) -> str:
     digest: str = json.loads(marker.read_text())["sha256"]
     expected = json.loads(RECIPE.read_text())["sha256"] if RECIPE.is_file() else digest
     if digest != expected:
-        print(
-            f"the set has hash {digest[:16]}, that of the results {expected[:16]}: pixels were rounded otherwise here"
-        )
+        hashes = f"the set has hash {digest[:16]}, that of the results {expected[:16]}"
+        print(f"{hashes}: pixels were rounded otherwise here")
     return digest
 
 

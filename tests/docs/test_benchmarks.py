@@ -13,7 +13,7 @@ import torch
 from benchmarks import __main__ as command
 from benchmarks import comparing, compiled, contenders, known_sets, measuring, models, report
 from benchmarks.measuring import Settings
-from benchmarks.problems import TINY, LeftOut, Problem, Scene
+from benchmarks.problems import TINY, Problem, Scene
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PROBLEMS = {
@@ -69,27 +69,6 @@ def test_a_contender_that_differs_is_not_timed(fault, what, monkeypatch):
         comparing.timings("work", PROBLEMS["unproject"], ["faulty"], Settings(repeats=1))
 
 
-@pytest.mark.parametrize("name", ["unproject", "unproject variance", "sweep", "sweep nearest flattened"])
-def test_the_kernel_alone_computes_what_the_public_call_does(name):
-    scene = Scene(PROBLEMS[name])
-    try:
-        runs = contenders.kernel(scene)
-    except LeftOut as reason:
-        pytest.skip(str(reason))
-    inputs, run, limit = (
-        comparing.leaves(scene),
-        contenders.ours(scene, "reference"),
-        comparing.tolerance(scene.problem),
-    )
-    expected, _ = comparing.forward(run, inputs)
-    for _ in range(2):  # buffers are used again
-        comparing.compare("values", runs["forward"]().reshape(expected.shape), expected, limit)
-        output, gradient = runs["forward+backward"]()
-    cotangent = scene.cotangent(output).reshape(expected.shape)
-    _, _, (expected_gradient,) = comparing.differentiate(run, inputs, cotangent)
-    comparing.compare("gradient", gradient, expected_gradient, limit)
-
-
 @pytest.mark.parametrize("name", models.MODELS)
 def test_a_model_that_differs_on_hand_written_operators_is_not_timed(name):
     work = models.Work(name, Settings(quick=True), scenes=2, views=2)
@@ -113,13 +92,13 @@ def test_a_known_allocation_is_measured(count):
         ("operators_contiguous", ["Unproject, variance, forward", "kernel, warm memory", "floor, fresh memory"]),
         ("footprint", ["Sweep and 1x1 map, 32 x 64 to 512, forward", "time grows as voxels to the power, forward"]),
         ("systems", ["Frustum, variance, forward", "kornia DepthWarper", "running mean (Atlas)"]),
-        ("growth", ["Sweep, trilinear, threads = 2, forward", "compiled for one number of threads"]),
-        ("models_gpu", ["V-LSM, inference, 1 x 4 views", "D-LSM, bfloat16, 16 x 4 views"]),
         ("gpu", ["Sweep, 128^3, nearest, forward+backward", "share of the copy's bandwidth"]),
         ("scenes", ["10 solids, 64 x 64, 1 x 20 views, shadows"]),
         ("render_set", ["lsmgeo render, 4 shapes of 2 views at 64 x 64 with depth and voxels"]),
         ("loading", ["4 of 4 views, 64 x 64, with depth", "4 of 4 views, 64 x 64, no depth"]),
-        ("imports", ["from lsmgeo import Unproject, VoxelGrid : import torch, kornia"]),
+        pytest.param("growth", ["threads = 2, forward", "compiled for one number of threads"], marks=pytest.mark.long),
+        pytest.param("models_gpu", ["V-LSM, inference", "D-LSM, bfloat16, 16 x 4 views"], marks=pytest.mark.long),
+        pytest.param("imports", ["from lsmgeo import Unproject, VoxelGrid : import"], marks=pytest.mark.long),
         pytest.param("operators_channels_last", ["hand-written : lsmgeo"], marks=pytest.mark.long),
         pytest.param("classical", ["analytic sphere", "TSDF, exact depth", "kornia warps"], marks=pytest.mark.long),
     ],

@@ -19,7 +19,6 @@ __all__ = [
     "cells_touched",
     "crossing_counts",
     "crossings",
-    "first_and_last",
     "line_extent",
 ]
 
@@ -141,17 +140,6 @@ def crossing_counts(triangles: np.ndarray, shape: Shape, line: Line, *, signed: 
         index = (step * columns + (found.column - column_low)) * rows + (found.row - row_low)
         np.add.at(counts, index, found.sign.astype(np.int32) if signed else np.int32(1))
     return counts.reshape(length + 1, columns, rows)
-
-
-def first_and_last(triangles: np.ndarray, shape: Shape, line: Line) -> tuple[np.ndarray, np.ndarray]:
-    """Where each line first and last crosses a triangle, (columns, rows) each; (inf, -inf) where it never does."""
-    (column_low, columns), (row_low, rows), _ = _size(shape, line)
-    first, last = np.full(columns * rows, np.inf), np.full(columns * rows, -np.inf)
-    for found in crossings(triangles, shape, line):
-        index = (found.column - column_low) * rows + (found.row - row_low)
-        np.minimum.at(first, index, found.place)
-        np.maximum.at(last, index, found.place)
-    return first.reshape(columns, rows), last.reshape(columns, rows)
 
 
 def cells_touched(triangles: np.ndarray, shape: Shape, finer: int = 4) -> np.ndarray:

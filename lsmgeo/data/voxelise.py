@@ -9,16 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_choice, check_flag
+from lsmgeo._checks import check_flag
 from lsmgeo.data.mesh_topology import Parts, are_real, disagreeing, distinct_faces, merged_faces, parts_of
 from lsmgeo.data.meshes import Mesh, check_mesh
-from lsmgeo.data.scan_conversion import LINES, Line, cells_touched, crossing_counts, first_and_last, line_extent
-from lsmgeo.errors import BackendError, OptionError
+from lsmgeo.data.scan_conversion import LINES, Line, cells_touched, crossing_counts, line_extent
+from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid
 
 __all__ = ["Plan", "plan_voxels", "voxelise"]
 
-METHODS = ("auto", "winding", "parity", "escape", "surface")
 LARGEST_RESOLUTION = 512
 AXES = LINES[:3]
 # Inside-out parts beyond this many are taken as such, without asking whether they are hollows of other parts.
@@ -28,7 +27,7 @@ Shape = tuple[int, int, int]
 
 
 class Plan(NamedTuple):
-    """How ``method="auto"`` treats the faces of a mesh, each (K, 3) by vertex number.
+    """How `voxelise` treats the faces of a mesh, each (K, 3) by vertex number.
 
     Attributes:
         closed: closed parts, faces turned to agree and outwards; the winding number decides.
@@ -47,7 +46,6 @@ def voxelise(
     mesh: Mesh,
     resolution: int | Shape = 32,
     *,
-    method: str = "auto",
     keep_thin: bool | None = None,
     lower: float | Sequence[float] = -0.5,
     upper: float | Sequence[float] = 0.5,
@@ -58,28 +56,18 @@ def voxelise(
     float64 with a rule for edges that leaves no gap, so a closed mesh gives exactly its occupancy; nothing is random,
     and no ray can miss or loop.
 
-    - "winding": a centre is inside where the surface winds around it (the nonzero rule). Parts may overlap. On a line
-      whose crossings do not balance there is a hole: the line abstains and the others decide, the three axes of a
-      watertight mesh, else 13 directions (axes, diagonals of faces and of the cube). Faces must agree on what is
-      outside.
-    - "parity": the same with odd and even for the winding number; faces need not agree, overlaps come out hollow.
-    - "escape": inside where all 26 ways out along those lines meet the surface. Needs no orientation and takes
-      overlaps and faces drawn twice; any hole lets much escape, and deep hollows fill.
-    - "surface": every voxel that the surface passes through (seen on a grid four times as fine) and what they
-      enclose; up to half a voxel too thick everywhere.
-    - "auto": each part connected through edges by what it is: closed parts by winding number, their faces made to
-      agree and turned outwards first (unless they hollow out another part); closed parts that no turning makes agree
-      by parity; parts with holes by vote; second copies of faces that make a part visible from both sides are left
-      out.
+    Each part connected through edges is treated by what it is. Of closed parts the winding number decides (the nonzero
+    rule, so parts may overlap), their faces made to agree and turned outwards first, unless they hollow out another
+    part; parity decides for closed parts that no turning makes agree. On a line whose crossings do not balance there is
+    a hole: the line abstains and the others decide, the three axes for closed parts, else 13 directions (axes,
+    diagonals of faces and of the cube). Second copies of faces that make a part visible from both sides are left out.
 
     Args:
         mesh: (N, 3) vertices in world units and (F, 3) faces.
         resolution: voxels along each side, or (D, H, W); 512 at most.
-        method: one of the above.
         keep_thin: add what is thinner than a voxel and would be lost: the voxels that the surface passes through
-            where no solid voxel is next to them, as seen along the surface's normals. By default only with "auto", and
-            only where the mesh is not watertight: of a watertight one exactly the voxels whose centres are inside are
-            solid, however few. Without it, all but "surface" are strictly solid-by-centre.
+            where no solid voxel is next to them, as seen along the surface's normals. By default only where the mesh is
+            not watertight: of a watertight one exactly the voxels whose centres are inside are solid, however few.
         lower: lower bounds of the grid, world units, a number or (x, y, z).
         upper: upper bounds.
 
@@ -91,7 +79,7 @@ def voxelise(
         DTypeError: not a `Mesh`, or arrays of other types.
         ShapeError: a wrong shape.
         GridError: an impossible grid.
-        OptionError: an unknown method, a resolution above 512, or vertices that are not finite.
+        OptionError: a resolution above 512, or vertices that are not finite.
         BackendError: scipy is not installed.
 
     Example:
@@ -99,7 +87,7 @@ def voxelise(
         >>> from lsmgeo.data import Mesh, voxelise
         >>> corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
         >>> faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-        >>> voxelise(Mesh(corners * 0.8 - 0.4, faces), 4, method="winding")[1].int()
+        >>> voxelise(Mesh(corners * 0.8 - 0.4, faces), 4)[1].int()
         tensor([[1, 1, 0, 0],
                 [1, 0, 0, 0],
                 [0, 0, 0, 0],
@@ -107,9 +95,8 @@ def voxelise(
     """
     who = "voxelise"
     check_mesh(who, mesh)
-    check_choice(who, "method", method, METHODS)
     if keep_thin is None:
-        keep_thin = method == "auto" and not mesh.watertight
+        keep_thin = not mesh.watertight
     check_flag(who, "keep_thin", keep_thin)
     grid = VoxelGrid(resolution, lower, upper)
     depth, height, width = shape = tuple(grid.shape)  # type: ignore[arg-type]
@@ -118,27 +105,14 @@ def voxelise(
     low, high = (np.array(bound, np.float64) for bound in (grid.lower, grid.upper))
     count = (width, height, depth)
     points = (mesh.vertices - low) / (high - low) * count - 0.5  # centres are whole numbers
-    triangles = points[mesh.faces]
-    if method == "auto":
-        solid = _solid_of_parts(points, plan_voxels(mesh), count)
-    elif method in ("winding", "parity"):
-        lines = AXES if mesh.watertight else LINES
-        solid = _by_vote(triangles, count, lines, signed=method == "winding")
-    elif method == "escape":
-        solid = _enclosed(triangles, count)
-    else:
-        try:
-            from scipy import ndimage
-        except ImportError as error:
-            raise BackendError(f"{who}: method='surface' needs the package scipy; install lsmgeo[data]") from error
-        solid = ndimage.binary_fill_holes(cells_touched(triangles, count) > 0)
+    solid = _solid_of_parts(points, plan_voxels(mesh), count)
     if keep_thin:
-        solid = _with_thin(solid, cells_touched(triangles, count))
+        solid = _with_thin(solid, cells_touched(points[mesh.faces], count))
     return torch.from_numpy(np.ascontiguousarray(solid.transpose(2, 1, 0)))
 
 
 def plan_voxels(mesh: Mesh) -> Plan:
-    """How ``voxelise(mesh, method="auto")`` will treat each part of a mesh.
+    """How ``voxelise(mesh)`` will treat each part of a mesh.
 
     Example:
         >>> import numpy as np
@@ -266,17 +240,6 @@ def _decided(votes: np.ndarray) -> np.ndarray:
         flat[open_cells] = changed
         open_cells = open_cells[changed == 0]
     return sign[1:-1, 1:-1, 1:-1] > 0
-
-
-def _enclosed(triangles: np.ndarray, count: Shape) -> np.ndarray:
-    """(W, H, D) bool: a crossing on either side along each of 13 lines."""
-    enclosed = np.ones(count, bool)
-    for line in LINES:
-        first, last = first_and_last(triangles, count, line)
-        slabs = np.moveaxis(enclosed, line.axis, 0)
-        for step, window in _windows(count, line):
-            slabs[step] &= (first[window] <= step) & (last[window] > step)
-    return enclosed
 
 
 def _with_thin(solid: np.ndarray, touched: np.ndarray) -> np.ndarray:

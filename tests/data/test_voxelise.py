@@ -13,12 +13,11 @@ from lsmgeo import scenes
 from lsmgeo.data import Mesh, from_trimesh, load_mesh, normalise, voxelise
 from lsmgeo.data.mesh_topology import merged_faces, parts_of
 from lsmgeo.data.scan_conversion import LINES, cells_touched, crossings
+from lsmgeo.data.voxelise import _by_vote as by_vote
 from lsmgeo.data.voxelise import plan_voxels, winding_number
 from lsmgeo.errors import BackendError, DTypeError, GridError, OptionError
 from lsmgeo.scenes.meshing import to_mesh
 from tests.data.real_meshes import folder_of_meshes, needs_meshes
-
-STRICT = ("winding", "parity", "escape")
 
 
 def centres(count, lower=-0.5, upper=0.5):
@@ -59,8 +58,7 @@ def test_unions_of_boxes_are_exact(seed, resolution):
     expected = in_boxes(centres(resolution), found)
     union = from_trimesh(trimesh.boolean.union(parts))
     assert union.watertight
-    for method in ("auto", *STRICT):
-        equal(voxelise(union, resolution, method=method), expected)
+    equal(voxelise(union, resolution), expected)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -68,10 +66,7 @@ def test_overlapping_parts_are_one_solid(seed):
     found, parts = boxes(seed)
     expected = in_boxes(centres(32), found)
     together = from_trimesh(trimesh.util.concatenate(parts))
-    for method in ("auto", "winding", "escape"):
-        equal(voxelise(together, method=method), expected)
-    # Parity takes what lies in two boxes for outside; it must, or it is not parity.
-    assert overlap(voxelise(together, method="parity"), expected) < 0.9
+    equal(voxelise(together), expected)
     for part in parts[::2]:
         part.invert()
     equal(voxelise(from_trimesh(trimesh.util.concatenate(parts))), expected)
@@ -87,15 +82,13 @@ def test_differences_and_hollows_are_exact():
     meshes = [trimesh.creation.box(bounds=(centre - half, centre + half)) for centre, half in (outer, inner)]
     cup = from_trimesh(trimesh.boolean.difference(meshes))
     expected = in_boxes(points, [outer]) & ~in_boxes(points, [inner])
-    for method in ("auto", "winding", "parity"):
-        equal(voxelise(cup, method=method), expected)
+    equal(voxelise(cup), expected)
     void = (np.zeros(3), np.array([0.15, 0.2, 0.1]))
     inside = trimesh.creation.box(bounds=(-void[1], void[1]))
     inside.invert()
     hollow = from_trimesh(trimesh.util.concatenate([meshes[0], inside]))
     expected = in_boxes(points, [outer]) & ~in_boxes(points, [void])
-    for method in ("auto", "winding", "parity"):
-        equal(voxelise(hollow, method=method), expected)
+    equal(voxelise(hollow), expected)
 
 
 def test_a_prism_is_exact():
@@ -111,16 +104,14 @@ def test_a_prism_is_exact():
     normals = np.stack([np.cos(middle), np.sin(middle)], 1)
     expected = (points[..., :2] @ normals.T < 0.42 * np.cos(np.deg2rad(36))).all(-1)
     expected &= (points[..., 2] > -0.33) & (points[..., 2] < 0.29)
-    for method in ("auto", *STRICT):
-        equal(voxelise(Mesh(vertices, np.array(faces)), method=method), expected)
+    equal(voxelise(Mesh(vertices, np.array(faces))), expected)
 
 
 @pytest.mark.parametrize("subdivisions", [1, 4])
 def test_spheres_agree_with_ray_tests_of_trimesh(subdivisions):
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.45)
     expected = ball.contains(centres(32).reshape(-1, 3)).reshape(32, 32, 32)
-    for method in ("auto", *STRICT):
-        equal(voxelise(from_trimesh(ball), method=method), expected)
+    equal(voxelise(from_trimesh(ball)), expected)
 
 
 @settings(max_examples=25)
@@ -134,7 +125,7 @@ def test_any_polyhedron_on_any_grid_agrees_with_solid_angles(seed, lower, shape)
     hull = trimesh.PointCloud(rng.uniform(-0.5, 0.5, (12, 3))).convex_hull
     mesh = from_trimesh(hull)
     upper = (0.5, 0.6, 0.7)
-    solid = voxelise(mesh, shape, method="winding", lower=lower, upper=upper).numpy()
+    solid = voxelise(mesh, shape, lower=lower, upper=upper).numpy()
     lines = [low + (np.arange(n) + 0.5) * (up - low) / n for low, up, n in zip(lower, upper, shape[::-1], strict=True)]
     z, y, x = np.meshgrid(*lines[::-1], indexing="ij")
     points = np.stack((x, y, z), -1).reshape(-1, 3)
@@ -147,13 +138,14 @@ def test_corners_edges_and_faces_through_centres_leave_no_gap():
     n = 8
     low, high = -0.5 + 1.5 / n, -0.5 + 6.5 / n
     box = from_trimesh(trimesh.creation.box(bounds=[[low] * 3, [high] * 3]))
-    for method in ("winding", "parity"):
-        solid = voxelise(box, n, method=method).numpy()
+    triangles = ((box.vertices + 0.5) * n - 0.5)[box.faces]
+    for signed in (True, False):
+        solid = by_vote(triangles, (n, n, n), LINES[:3], signed=signed)
         assert solid[2:6, 2:6, 2:6].all()  # centres 2 to 5 are within; 1 and 6 are on the surface
         assert int(solid[1:6, 1:6, 1:6].sum()) == int(solid.sum()) == 125  # of each pair of sides one is within
     for line in LINES:
         count = np.zeros((64, 64), int)
-        for found in crossings(((box.vertices + 0.5) * n - 0.5)[box.faces], (n, n, n), line):
+        for found in crossings(triangles, (n, n, n), line):
             np.add.at(count, (found.column + 20, found.row + 20), 1)
         assert count.any()
         assert (count % 2 == 0).all()
@@ -182,8 +174,6 @@ def test_a_twentieth_of_the_faces_may_be_missing(solid, seed):
     assert not holed.watertight
     assert overlap(voxelise(holed, keep_thin=False), expected) >= 0.999
     assert overlap(voxelise(holed), expected) >= 0.99
-    # Through any hole something escapes, which is what voting is for.
-    assert overlap(voxelise(holed, method="escape"), expected) < 0.9
 
 
 def test_a_lost_floor_and_a_lost_cap_do_not_matter():
@@ -205,8 +195,6 @@ def test_faces_drawn_from_both_sides_are_taken_once():
     mesh = from_trimesh(trimesh.boolean.union(parts))
     twice = Mesh(mesh.vertices, np.concatenate((mesh.faces, mesh.faces[:, ::-1])))
     equal(voxelise(twice), in_boxes(centres(32), found))
-    equal(voxelise(twice, method="escape"), in_boxes(centres(32), found))
-    assert not voxelise(twice, method="winding").any()
 
 
 def test_thin_things_are_kept_where_asked():
@@ -232,15 +220,10 @@ def test_thin_things_are_kept_where_asked():
 def test_surface_voxels_hold_every_point_of_the_surface():
     mesh = trimesh.creation.torus(0.3, 0.12)
     points = mesh.sample(20_000, seed=0)
-    touched = voxelise(from_trimesh(mesh), method="surface").numpy()
-    x, y, z = np.floor((points + 0.5) * 32).astype(int).T
-    assert touched[z, y, x].mean() > 0.99  # what is missed grazes a corner, by less than the finer lattice sees
-    # It encloses the solid, and nothing farther than a voxel's diagonal.
-    solid = voxelise(from_trimesh(mesh), method="winding").numpy()
-    assert touched[solid].all()
-    x, y, z = centres(32)[touched & ~solid].T
-    away = np.hypot(np.hypot(x, y) - 0.3, z) - 0.12
-    assert away.max() < np.sqrt(3) / 64
+    touched = cells_touched((mesh.triangles + 0.5) * 32 - 0.5, (32, 32, 32)) > 0
+    assert touched[tuple(np.floor((points + 0.5) * 32).astype(int).T)].mean() > 0.99  # what is missed grazes a corner
+    x, y, z = centres(32).transpose(2, 1, 0, 3)[touched].T
+    assert np.abs(np.hypot(np.hypot(x, y) - 0.3, z) - 0.12).max() < np.sqrt(3) / 64  # half a voxel's diagonal
 
 
 def test_touched_voxels_know_the_axes_of_their_normals():
@@ -301,25 +284,19 @@ def test_a_one_sided_surface_ends_and_is_kept():
 def test_the_same_input_gives_the_same_bits():
     mesh = fine(trimesh.util.concatenate(boxes(3)[1]))
     kept = Mesh(mesh.vertices, mesh.faces[np.random.default_rng(0).random(len(mesh.faces)) >= 0.1])
-    for method in ("auto", "winding", "parity", "escape", "surface"):
-        assert torch.equal(voxelise(kept, method=method), voxelise(kept, method=method))
+    assert torch.equal(voxelise(kept), voxelise(kept))
 
 
 def test_without_scipy_the_extra_is_named(monkeypatch):
     box = from_trimesh(trimesh.creation.box((0.5, 0.4, 0.3)))
-    expected = voxelise(box, 8)
     for name in ("scipy", "scipy.sparse"):
         monkeypatch.setitem(sys.modules, name, None)
-    for method in ("auto", "surface"):
-        with pytest.raises(BackendError, match=r"scipy; install lsmgeo\[data\]"):
-            voxelise(box, 8, method=method)
-    assert torch.equal(voxelise(box, 8, method="winding"), expected)
+    with pytest.raises(BackendError, match=r"scipy; install lsmgeo\[data\]"):
+        voxelise(box, 8)
 
 
 def test_options_are_checked():
     mesh = from_trimesh(trimesh.creation.box((0.5, 0.5, 0.5)))
-    with pytest.raises(OptionError, match="method must be one of 'auto', 'winding'"):
-        voxelise(mesh, method="binvox")
     with pytest.raises(OptionError, match="at most 512 voxels a side; got"):
         voxelise(mesh, 513)
     with pytest.raises(OptionError, match="keep_thin must be True or False"):

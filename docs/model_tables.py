@@ -16,7 +16,7 @@ from sphinx.util.docutils import SphinxDirective
 
 from benchmarks.experiments import collecting, queue
 from lsmgeo.models import create
-from lsmgeo.models.presets import PRESETS, RELEASES
+from lsmgeo.models.creating import PRESETS, RELEASES
 from lsmgeo.models.training import config as configuration
 
 GROUPS = configuration.GROUPS

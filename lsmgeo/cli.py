@@ -245,14 +245,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit status: 0, 1 or 3 as `info` says, 2 after a wrong argument or a file that cannot be used, 130 after an
-        interrupt.
+        interrupt, 141 where what is printed is no longer read.
     """
+    import os
     from argparse import ArgumentError
 
     from lsmgeo.errors import LsmGeoError
 
     try:
-        return _run(arguments)
+        try:
+            return _run(arguments)
+        finally:
+            sys.stdout.flush()
     except ArgumentError as error:
         print(f"lsmgeo: error: {_reason(str(error))} (see lsmgeo --help)", file=sys.stderr)
         return 2
@@ -262,6 +266,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("lsmgeo: interrupted", file=sys.stderr)
         return 130
+    except BrokenPipeError:
+        # Whoever read has read enough, as head does; what is left to print goes nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 141
 
 
 def _run(arguments: Sequence[str] | None) -> int:

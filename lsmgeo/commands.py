@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import Literal
+from typing import Any, Literal
 
 __all__ = ["evaluate", "reconstruct", "train"]
 
@@ -210,41 +210,21 @@ def reconstruct(
     if name is not None and name not in images.names:
         raise OptionError(f"view must be a photograph that can be read: {left_out[0]}")
     reference = None if name is None else images.names.index(str(name))
-    seen = "" if name is None else f", from {name}"
+    title = {"hull": "visual hull", "sweep": "plane sweep"}.get(method, method.upper())
+    title = f"{Path(scene).resolve().name}, {title}{'' if name is None else f', from {name}'}"
+    masked: dict[str, Any] = {"masks": masks, "background": background, "resolution": resolution, "size": size}
     if method == "hull":
-        title = f"{Path(scene).resolve().name}, visual hull{seen}"
-        results = hull_results(
-            images,
-            reference,
-            title,
-            rule=rule,
-            masks=masks,
-            background=background,
-            resolution=resolution,
-            size=size,
-        )
+        results = hull_results(images, reference, title, rule=rule, **masked)
     elif method in learnt:
         from lsmgeo.models.reconstructing import learnt_results
 
-        results = learnt_results(
-            images,
-            reference,
-            f"{Path(scene).resolve().name}, {method.upper()}{seen}",
-            method=method,
-            weights=weights,
-            views=views,
-            box=box,
-            threshold=threshold,
-            masks=masks,
-            background=background,
-            resolution=resolution,
-            size=size,
-        )
+        masked |= {"method": method, "weights": weights, "views": views, "box": box, "threshold": threshold}
+        results = learnt_results(images, reference, title, **masked)
     else:
         results = sweep_results(
             images,
             reference,
-            f"{Path(scene).resolve().name}, plane sweep{seen}",
+            title,
             check=check,
             resolution=resolution,
             density=density,

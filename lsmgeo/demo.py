@@ -18,6 +18,7 @@ from torch import Tensor
 
 from lsmgeo import PlaneSweepProject, Unproject, VoxelGrid, depth_planes, scenes
 from lsmgeo.cameras import CameraTensors, orbit, rays
+from lsmgeo.functional import unproject_points
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -99,19 +100,14 @@ def _picture(
 
 
 def _seen_by(points: Tensor, cameras: CameraTensors, scene: scenes.Scene) -> Tensor:
-    """How many cameras see each surface point (..., 3): in the picture, and with nothing in between."""
-    count = torch.zeros(points.shape[:-1], dtype=torch.int64)
-    sizes = (torch.as_tensor(size) for size in cameras[2:])
-    for K, E, height, width in zip(cameras.intrinsics, cameras.cam_from_world, *sizes, strict=True):
-        camera = points @ E[:3, :3].T + E[:3, 3]
-        pixel = camera @ K.T
-        x, y = pixel[..., 0] / pixel[..., 2], pixel[..., 1] / pixel[..., 2]
-        inside = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
-        center = -E[:3, :3].T @ E[:3, 3]
-        towards = (points - center).reshape(1, -1, 3)
-        first = scenes.trace([scene], center.expand_as(towards), towards).distance.view(count.shape)
-        count += inside & (first > 1 - 1e-3)
-    return count
+    """How many cameras see each surface point (H, W, 3): in the picture, and with nothing in between."""
+    origins = rays(cameras)[0][:, None]  # (V, 1, 3)
+    towards = points.reshape(1, -1, 3) - origins  # (V, H * W, 3)
+    first = scenes.trace([scene], origins.expand_as(towards).reshape(1, -1, 3), towards.reshape(1, -1, 3)).distance
+    nothing = points.new_zeros(1, len(origins), 0, *points.shape[:2])  # the pictures without a channel
+    batch = CameraTensors(*(torch.as_tensor(value)[None] for value in cameras))
+    inside = unproject_points(nothing, batch, points.reshape(1, -1, 3)).visible[0]
+    return (inside & (first.view(inside.shape) > 1 - 1e-3)).sum(0).view(points.shape[:2])
 
 
 def run_demo(*, size: tuple[int, int] = (120, 160), voxels: int = 72, planes: int = 160) -> DemoResult:

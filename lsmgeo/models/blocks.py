@@ -8,11 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, conv3d, conv_transpose2d, conv_transpose3d, group_norm, pad
 
-from lsmgeo._checks import check_choice
-
 __all__ = ["Block", "Convolution", "InstanceNorm", "interleave"]
-
-NORMS = ("scale", "shift", "none")
 
 
 class Convolution(nn.Module):
@@ -89,7 +85,6 @@ class InstanceNorm(nn.Module):
     Args:
         channels: of the input.
         scale: whether to learn a scale too.
-        eps: added to the variance.
 
     Example:
         >>> import torch
@@ -98,16 +93,15 @@ class InstanceNorm(nn.Module):
         tensor([-1.3416, -0.4472, 0.4472, 1.3416], grad_fn=<ViewBackward0>)
     """
 
-    def __init__(self, channels: int, *, scale: bool = True, eps: float = 1e-5) -> None:
+    def __init__(self, channels: int, *, scale: bool = True) -> None:
         super().__init__()
-        self.eps = eps
         self.weight = nn.Parameter(torch.ones(channels)) if scale else None
         self.bias = nn.Parameter(torch.zeros(channels))
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalise (N, C, ...)."""
         # One group a channel. On a CPU, channels-last memory costs it nine times as much as the copy.
-        return group_norm(x.contiguous(), x.shape[1], self.weight, self.bias, self.eps)
+        return group_norm(x.contiguous(), x.shape[1], self.weight, self.bias)
 
 
 class Block(nn.Module):
@@ -143,7 +137,6 @@ class Block(nn.Module):
         transposed: bool = False,
     ) -> None:
         super().__init__()
-        check_choice("Block", "norm", norm, NORMS)
         self.activate = activate
         self.convolution = Convolution(
             dims,

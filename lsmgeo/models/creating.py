@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from difflib import get_close_matches
 from typing import Any
 
 from torch import nn
@@ -13,18 +12,91 @@ from lsmgeo._checks import check_choice, describe
 from lsmgeo.errors import DTypeError, OptionError
 from lsmgeo.models.depth_lsm import DepthLSM
 from lsmgeo.models.model import Model
-from lsmgeo.models.presets import PRESETS, RELEASES
-from lsmgeo.models.r2n2 import R2N2
-from lsmgeo.models.settings import VARIANTS
+from lsmgeo.models.r2n2 import R2N2, R2N2Settings
+from lsmgeo.models.settings import DepthSettings, VoxelSettings, nearest
 from lsmgeo.models.voxel_lsm import VoxelLSM
 
-__all__ = ["MODELS", "create", "from_settings", "settings_of"]
+__all__ = ["MODELS", "PRESETS", "RELEASES", "create", "from_settings", "settings_of"]
 
 MODELS: dict[str, type[Model]] = {
     "voxel-lsm": VoxelLSM,
     "depth-lsm": DepthLSM,
     "r2n2": R2N2,
     "r2n2-pose": R2N2,
+}
+
+# Views are fused on 16^3 cells, but their features are sampled at 32^3. The recurrence works point by point: with 3^3
+# kernels it takes most of a step's time, and the grid network sees the neighbours.
+_COMPACT: dict[str, Any] = {
+    "image_size": 128,
+    "grid_size": 16,
+    "encoder_channels": (16, 32, 64, 96),
+    "grid_channels": (48, 96),
+    "feature_channels": 8,
+    "feature_stride": 4,
+    "lift": 2,
+    "input_kernel": 1,
+    "state_kernel": 1,
+    "output_channels": 16,
+    "grid_skip": True,
+}
+_TINY: dict[str, Any] = {
+    "image_size": 32,
+    "grid_size": 8,
+    "encoder_channels": (8, 12),
+    "grid_channels": (8, 12),
+    "feature_channels": 8,
+    "hidden_channels": 8,
+    "input_kernel": 1,
+    "state_kernel": 1,
+    "output_channels": 8,
+    "grid_skip": True,
+}
+_COMPACT_R2N2: dict[str, Any] = {
+    "image_size": 64,
+    "channels": (24, 48, 96, 128, 128),
+    "shortcuts": ("none", "convolution", "convolution", "convolution", "identity"),
+    "features": 256,
+    "pose_features": 64,
+    "hidden": 64,
+    "decoder": (64, 32, 16),
+    "upsample": 2,
+}
+_TINY_R2N2: dict[str, Any] = {
+    "image_size": 32,
+    "channels": (8, 12, 16, 16),
+    "shortcuts": ("none", "convolution", "convolution", "identity"),
+    "features": 12,
+    "pose_features": 4,
+    "hidden": 8,
+    "decoder": (8, 8, 4),
+}
+
+
+def _presets(paper: Any, compact: Any, tiny: Any) -> dict[str, Any]:
+    # "standard" is what the experiments use: a wider network was no better in the same time (docs/experiments).
+    return {"paper": paper, "compact": compact, "standard": compact, "tiny": tiny}
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "voxel-lsm": _presets(VoxelSettings(), VoxelSettings(**_COMPACT, upsample=2), VoxelSettings(**_TINY, upsample=2)),
+    "depth-lsm": _presets(
+        DepthSettings(),
+        DepthSettings(**_COMPACT, planes=24, ray_channels=(128, 64), projection="trilinear"),
+        DepthSettings(**_TINY, planes=8, ray_channels=(16, 12), projection="trilinear"),
+    ),
+    "r2n2": _presets(R2N2Settings(), R2N2Settings(**_COMPACT_R2N2), R2N2Settings(**_TINY_R2N2)),
+    "r2n2-pose": _presets(
+        R2N2Settings(pose=True),
+        R2N2Settings(pose=True, **_COMPACT_R2N2),
+        R2N2Settings(pose=True, **_TINY_R2N2),
+    ),
+}
+
+# Built layer by layer as released; there is one of each.
+RELEASES: dict[str, Any] = {
+    "voxel-lsm": VoxelSettings(variant="release"),
+    "depth-lsm": DepthSettings(variant="release", ray_channels=(512,)),
 }
 
 
@@ -55,7 +127,7 @@ def create(name: str, *, preset: str = "paper", variant: str = "paper", **overri
     """
     cls = _class(name)
     check_choice("create", "preset", preset, tuple(PRESETS[name]))
-    check_choice("create", "variant", variant, VARIANTS)
+    check_choice("create", "variant", variant, ("paper", "release"))
     settings = PRESETS[name][preset]
     if variant == "release":
         if preset != "paper" or name not in RELEASES:
@@ -116,7 +188,5 @@ def from_settings(settings: Mapping[str, Any]) -> Model:
 
 def _class(name: object) -> type[Model]:
     if not isinstance(name, str) or name not in MODELS:
-        close = get_close_matches(name, MODELS, 1) if isinstance(name, str) else []
-        hint = f" (is {close[0]!r} meant?)" if close else ""
-        raise OptionError(f"create: name must be one of {', '.join(map(repr, MODELS))}; got {describe(name)}{hint}")
+        raise OptionError(f"create: name must be one of the models; got {describe(name)}{nearest(name, list(MODELS))}")
     return MODELS[name]

@@ -16,7 +16,8 @@ from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid, depth_planes
 from lsmgeo.layers import PlaneSweepProject
 from lsmgeo.models.blocks import Block, Convolution, InstanceNorm
-from lsmgeo.models.machine import Machine, evaluating, moved_center, views_of
+from lsmgeo.models.machine import Machine, moved_center, views_of
+from lsmgeo.models.model import evaluating
 from lsmgeo.models.outputs import DepthOutput, DepthResult
 from lsmgeo.models.settings import DepthSettings, changed
 from lsmgeo.rays import ProjectReduce
@@ -98,7 +99,7 @@ class DepthLSM(Machine):
     output = "depth"
 
     def __init__(self, settings: DepthSettings = PAPER, **changes: Any) -> None:
-        settings = changed(self.name, settings, changes)
+        settings = changed(settings, changes)
         super().__init__(settings)
         self.settings = settings
         is_release = settings.variant == "release"

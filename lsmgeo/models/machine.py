@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lsmgeo._checks import check_devices, check_float, check_mask
 from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes
@@ -21,7 +20,7 @@ from lsmgeo.models.model import Model
 from lsmgeo.models.outputs import chosen_steps
 from lsmgeo.models.settings import MachineSettings
 
-__all__ = ["Machine", "Seen", "evaluating", "moved_center", "views_of"]
+__all__ = ["Machine", "Seen", "moved_center", "views_of"]
 
 
 class Seen(NamedTuple):
@@ -121,18 +120,6 @@ def moved_center(who: str, cameras: Cameras, pixels: float) -> CameraTensors:
     offset = torch.zeros_like(tensors.intrinsics)
     offset[..., :2, 2] = pixels
     return tensors._replace(intrinsics=tensors.intrinsics + offset)
-
-
-@contextmanager
-def evaluating(model: nn.Module) -> Iterator[None]:
-    """Evaluation mode and no gradients inside; the mode before, after."""
-    was_training = model.training
-    model.eval()
-    try:
-        with torch.no_grad():
-            yield
-    finally:
-        model.train(was_training)
 
 
 def views_of(who: str, cameras: Cameras, scenes: int) -> CameraTensors:

@@ -6,26 +6,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import prod, sqrt
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu
 
-from lsmgeo._checks import check_choice, check_devices, check_flag, check_float, check_mask, check_whole, describe
-from lsmgeo.cameras.tensors import Cameras, as_tensors, check_cameras
+from lsmgeo._checks import check_devices, check_float, check_mask
+from lsmgeo.cameras.tensors import Cameras, check_cameras
 from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.grids import VoxelGrid
 from lsmgeo.models.blocks import interleave
-from lsmgeo.models.machine import evaluating
-from lsmgeo.models.model import Model
-from lsmgeo.models.outputs import VoxelOutput, VoxelResult, chosen_steps
-from lsmgeo.models.settings import changed, check_channels
+from lsmgeo.models.machine import views_of
+from lsmgeo.models.model import VoxelModel
+from lsmgeo.models.outputs import VoxelOutput, chosen_steps
+from lsmgeo.models.settings import changed, check_settings
 
 __all__ = ["R2N2", "R2N2Settings"]
-
-SHORTCUTS = ("none", "convolution", "identity")
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,9 @@ class R2N2Settings:
     pose: bool = False
     image_size: int = 224
     channels: tuple[int, ...] = (96, 128, 256, 256, 256, 256)
-    shortcuts: tuple[str, ...] = ("none", "convolution", "convolution", "none", "convolution", "identity")
+    shortcuts: tuple[Literal["none", "convolution", "identity"], ...] = (
+        *("none", "convolution", "convolution", "none", "convolution", "identity"),
+    )
     features: int = 1024
     pose_features: int = 128
     coarse: int = 4
@@ -61,23 +61,15 @@ class R2N2Settings:
         """Voxels along a side of the output."""
         return (self.coarse << (len(self.decoder) - 1)) * self.upsample
 
-    def check(self, who: str) -> None:
-        """Raise an `OptionError` that names the first impossible setting."""
-        check_flag(who, "pose", self.pose)
-        for name, most in (("image_size", 4096), ("features", 1 << 16), ("pose_features", 1 << 16), ("coarse", 64)):
-            check_whole(who, name, getattr(self, name), 1, most)
-        check_whole(who, "hidden", self.hidden, 1, 4096)
-        check_whole(who, "upsample", self.upsample, 1, 4)
-        check_channels(who, "channels", self.channels)
-        check_channels(who, "decoder", self.decoder)
+    def __post_init__(self) -> None:
+        who = type(self).__name__
+        check_settings(who, self, features=(1, 1 << 16), pose_features=(1, 1 << 16), coarse=(1, 64), upsample=(1, 4))
         if len(self.decoder) < 2:
             raise OptionError(f"{who}: decoder must be two whole numbers at least; got {self.decoder}")
-        if not isinstance(self.shortcuts, tuple) or len(self.shortcuts) != len(self.channels):
-            raise OptionError(f"{who}: shortcuts must be one for each of channels; got {describe(self.shortcuts)}")
-        before = (3, *self.channels)
-        for number, shortcut in enumerate(self.shortcuts):
-            check_choice(who, "shortcuts", shortcut, SHORTCUTS)
-            if shortcut == "identity" and before[number] != before[number + 1]:
+        if len(self.shortcuts) != len(self.channels):
+            raise OptionError(f"{who}: shortcuts must be one for each of channels; got {self.shortcuts}")
+        for before, after, shortcut in zip((3, *self.channels), self.channels, self.shortcuts, strict=False):
+            if shortcut == "identity" and before != after:
                 raise OptionError(
                     f"{who}: shortcuts must not be 'identity' where channels change; got {self.shortcuts}"
                 )
@@ -178,7 +170,7 @@ class _Recurrence(nn.Module):
         return torch.stack(states, 1)
 
 
-class R2N2(Model):
+class R2N2(VoxelModel):
     """The residual-GRU network of 3D-R2N2, with or without the cameras' rotation.
 
     Images become vectors, one by one; a recurrence on a coarse grid reads them in their order; from its state a decoder
@@ -212,12 +204,11 @@ class R2N2(Model):
         torch.Size([1, 3, 8, 8, 8])
     """
 
-    output = "voxels"
     prefers_channels_last = True
 
     def __init__(self, settings: R2N2Settings = PAPER, **changes: Any) -> None:
         super().__init__()
-        settings = changed("R2N2", settings, changes)
+        settings = changed(settings, changes)
         self.settings = settings
         self.name = "r2n2-pose" if settings.pose else "r2n2"
         self.image_size = settings.image_size
@@ -273,29 +264,6 @@ class R2N2(Model):
         states = self.recurrence(vectors, mask)[:, after]
         return VoxelOutput(self.decoder(states.flatten(0, 1)).unflatten(0, states.shape[:2]))
 
-    def run(
-        self, images: Tensor, cameras: Cameras, view_mask: Tensor | None = None, *, by_view: bool = True
-    ) -> VoxelResult:
-        """Probabilities of occupancy, in evaluation mode and without gradients.
-
-        Args:
-            images: (B, V, 3, H, W) in [0, 1].
-            cameras: B*V cameras.
-            view_mask: (B, V) bool.
-            by_view: whether to decode what is told after every view too.
-
-        Returns:
-            `VoxelResult`, float32.
-
-        Raises:
-            ShapeError, DTypeError, DeviceError, CameraError, OptionError: see `lsmgeo.errors`.
-        """
-        check_flag(self.name, "by_view", by_view)
-        with evaluating(self):
-            logits = self(images, cameras, view_mask, steps=None if by_view else "last").logits
-            occupancy = logits.float().sigmoid()
-        return VoxelResult(occupancy[:, -1], occupancy if by_view else None)
-
     def extra_repr(self) -> str:
         """The settings."""
         return repr(self.settings)
@@ -315,16 +283,16 @@ class R2N2(Model):
 
     def _quaternions(self, cameras: Cameras, mask: Tensor, images: Tensor) -> Tensor:
         """(B, V, 4) as w, x, y, z; of masked views, whose cameras are not read, that of no rotation."""
-        tensors = as_tensors(cameras, self.name)
-        views, leading = tuple(mask.shape), tuple(tensors.cam_from_world.shape[:-2])
-        if leading not in (views, (prod(views),)):
+        views = tuple(mask.shape)
+        tensors = views_of(self.name, cameras, len(mask))
+        if (leading := tuple(tensors.cam_from_world.shape[:-2])) != views:
             raise ShapeError(
                 f"{self.name}: cameras must have leading shape (B, V) = {views}, or (B*V,) with the view fastest; "
                 f"got {leading}"
             )
         check_devices(self.name, images=images, cameras=tensors.cam_from_world)
-        check_cameras(self.name, tensors, mask.reshape(leading))
-        R = tensors.cam_from_world[..., :3, :3].reshape(*views, 3, 3)
+        check_cameras(self.name, tensors, mask)
+        R = tensors.cam_from_world[..., :3, :3]
         R = torch.where(mask[..., None, None], R, torch.eye(3, dtype=R.dtype, device=R.device))
         quaternions = rotation_matrix_to_quaternion(R)
         return torch.where(quaternions[..., 3:] < 0, -quaternions, quaternions).to(images.dtype)

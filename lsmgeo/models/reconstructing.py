@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -38,7 +39,7 @@ from lsmgeo.models.placing import (
     spread_views,
 )
 from lsmgeo.models.voxel_lsm import VoxelLSM
-from lsmgeo.models.weights import load, read_weights
+from lsmgeo.models.weights import load
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -186,7 +187,7 @@ def learnt_results(
             f"a cube of {found.placement.side:.4g} about {x:.4g}, {y:.4g}, {z:.4g}, told by {found.placement.told_by}",
         ),
     )
-    notes = (*_barely_trained(weights), *found.notes)
+    notes = (*_barely_trained(model.about), *found.notes)
     results = Results(title, facts, notes, (), np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8), None)
     if method == "v-lsm":
         return _with_voxels(scene, results, found, model.grid, threshold, resolution, size)
@@ -337,10 +338,9 @@ def _load(method: str, weights: str | os.PathLike[str] | None) -> VoxelLSM | Dep
     )
 
 
-def _barely_trained(weights: str | os.PathLike[str] | None) -> tuple[str, ...]:
+def _barely_trained(about: Mapping[str, Any]) -> tuple[str, ...]:
     """A note where training left a network that is still bad on its validation split, as its file says."""
-    assert weights is not None
-    validation: Any = read_weights(weights).about.get("validation")
+    validation: Any = about.get("validation")
     try:
         is_iou, value, step = validation["measure"] == "iou", float(validation["by_view"][-1]), int(validation["step"])
     except (TypeError, KeyError, IndexError, ValueError):

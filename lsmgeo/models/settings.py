@@ -1,19 +1,85 @@
-"""Settings of the two learnt stereo machines: frozen values that JSON can hold, checked when a model is built."""
+"""Settings: frozen values that JSON can hold, checked when they are made; those of the two learnt stereo machines."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import collections.abc
+import contextlib
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
-from typing import Any, TypeVar
+from numbers import Integral, Real
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from lsmgeo._checks import check_choice, check_flag, check_number, check_whole, describe
+from lsmgeo._checks import describe
 from lsmgeo.errors import OptionError
 
-__all__ = ["VARIANTS", "DepthSettings", "MachineSettings", "VoxelSettings", "changed"]
+__all__ = ["DepthSettings", "MachineSettings", "VoxelSettings", "changed", "check_settings", "nearest"]
 
-VARIANTS = ("paper", "release")
 LARGEST_SIDE = 4096
+LONGEST_LIST = 64
+NUMBERS: dict[Any, type] = {int: Integral, float: Real}
+
+Settings = TypeVar("Settings")
+Limits = tuple[float, float]
+
+
+def check_settings(who: str, settings: Any, whole: Limits = (1, LARGEST_SIDE), **limits: Limits) -> None:
+    """Require that settings are of the types that they are annotated with, and within limits.
+
+    Lists, as JSON has them, become tuples, and whole numbers real ones, where those are wanted.
+
+    Args:
+        who: named in errors.
+        settings: a dataclass whose fields are text, choices of it, flags, numbers, tuples, mappings or None.
+        whole: the least and the largest whole number, where `limits` say nothing else. Real numbers are positive.
+        limits: by the names of settings, the least and the largest number.
+
+    Raises:
+        OptionError: the first setting that is none, with what was expected and what came.
+    """
+    kinds = get_type_hints(type(settings))
+    for item in fields(settings):
+        value, words = getattr(settings, item.name), str(item.type)
+        least, most = limits.get(item.name) or (whole if "int" in words else (math.ulp(0.0), math.inf))
+        try:
+            object.__setattr__(settings, item.name, _converted(value, kinds[item.name], least, most))
+        except TypeError:
+            if "int" in words or "float" in words:
+                bounds = f"at least {least}" if most >= 2**63 - 1 else f"from {least} to {most}"
+                words += f", {'above 0' if least == math.ulp(0.0) else bounds}"
+            raise OptionError(f"{who}: {item.name} must be {words}; got {describe(value)}") from None
+
+
+def _converted(value: Any, kind: Any, least: float, most: float) -> Any:
+    """A value as a kind of setting; a TypeError where it is none."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (UnionType, Union):
+        for one in inner:
+            with contextlib.suppress(TypeError):
+                return _converted(value, one, least, most)
+    elif origin is tuple and isinstance(value, (list, tuple)):
+        if inner[-1] is Ellipsis and 1 <= len(value) <= LONGEST_LIST:
+            inner = inner[:1] * len(value)
+        if len(inner) == len(value) and Ellipsis not in inner:
+            return tuple(_converted(one, of, least, most) for one, of in zip(value, inner, strict=True))
+    elif origin is collections.abc.Mapping and isinstance(value, Mapping):
+        return dict(value)
+    elif origin is Literal and isinstance(value, str) and value in inner:
+        return value
+    elif kind in (str, bool, NoneType) and isinstance(value, kind):
+        return value
+    elif kind in NUMBERS and isinstance(value, NUMBERS[kind]) and not isinstance(value, bool):
+        if least <= value <= most and math.isfinite(value):
+            return kind(value)
+    raise TypeError
+
+
+def nearest(name: object, known: Sequence[str]) -> str:
+    """What may have been meant by a name that there is not, for an error's end."""
+    close = get_close_matches(str(name), known, 1)
+    return f"; did you mean {close[0]}?" if close else f"; there are {', '.join(known)}"
 
 
 @dataclass(frozen=True)
@@ -43,20 +109,20 @@ class MachineSettings:
             small networks need: it is the one way for detail of the grid's own size.
     """
 
-    variant: str = "paper"
+    variant: Literal["paper", "release"] = "paper"
     image_size: int = 224
     grid_size: int = 32
     encoder_channels: tuple[int, ...] = (32, 64, 128, 256)
     feature_channels: int = 32
     feature_stride: int = 2
     lift: int = 1
-    fusion: str = "gru"
+    fusion: Literal["gru", "lstm"] = "gru"
     input_kernel: int = 3
     state_kernel: int = 3
     hidden_channels: int = 32
     grid_channels: tuple[int, ...] = (32, 64, 128)
     output_channels: int = 32
-    pixel_rules: str = "exact"
+    pixel_rules: Literal["exact", "release"] = "exact"
     grid_skip: bool = False
 
     @property
@@ -64,22 +130,13 @@ class MachineSettings:
         """What the sides of images must be divisible by."""
         return 1 << len(self.encoder_channels)
 
-    def check(self, who: str) -> None:
-        """Raise an `OptionError` that names the first impossible setting."""
-        check_choice(who, "variant", self.variant, VARIANTS)
-        check_choice(who, "fusion", self.fusion, ("gru", "lstm"))
-        check_choice(who, "pixel_rules", self.pixel_rules, ("exact", "release"))
-        for name in ("feature_channels", "hidden_channels", "output_channels"):
-            check_whole(who, name, getattr(self, name), 1, LARGEST_SIDE)
-        check_flag(who, "grid_skip", self.grid_skip)
-        check_whole(who, "lift", self.lift, 1, 4)
-        for name in ("input_kernel", "state_kernel"):
-            if check_whole(who, name, getattr(self, name), 1, 15) % 2 == 0:
+    def __post_init__(self) -> None:
+        who = type(self).__name__
+        kernels: dict[str, Limits] = {"input_kernel": (1, 15), "state_kernel": (1, 15)}
+        check_settings(who, self, lift=(1, 4), upsample=(1, 4), grid_size=(1, 256), planes=(2, LARGEST_SIDE), **kernels)
+        for name in kernels:
+            if getattr(self, name) % 2 == 0:
                 raise OptionError(f"{who}: {name} must be odd; got {getattr(self, name)}")
-        for name in ("encoder_channels", "grid_channels"):
-            check_channels(who, name, getattr(self, name))
-        check_whole(who, "image_size", self.image_size, 1, LARGEST_SIDE)
-        check_whole(who, "grid_size", self.grid_size, 1, 256)
         # Maps of one pixel have no variance to be normalised by.
         if self.image_size % self.image_stride or self.image_size < 2 * self.image_stride:
             raise OptionError(
@@ -92,7 +149,13 @@ class MachineSettings:
                 f"{who}: grid_size must be a multiple of {coarsest}, 2 to the number of grid_channels, and twice that "
                 f"at least; got {self.grid_size}"
             )
-        check_stride(who, "feature_stride", self.feature_stride, len(self.encoder_channels))
+        self._check_stride("feature_stride")
+
+    def _check_stride(self, name: str) -> None:
+        strides = [2 << level for level in range(len(self.encoder_channels))]
+        if (stride := getattr(self, name)) not in strides:
+            allowed = ", ".join(map(str, strides))
+            raise OptionError(f"{type(self).__name__}: {name} must be one of {allowed}; got {stride}")
 
 
 @dataclass(frozen=True)
@@ -105,12 +168,10 @@ class VoxelSettings(MachineSettings):
 
     upsample: int = 1
 
-    def check(self, who: str) -> None:
-        """Raise an `OptionError` that names the first impossible setting."""
-        super().check(who)
-        check_whole(who, "upsample", self.upsample, 1, 4)
+    def __post_init__(self) -> None:
+        super().__post_init__()
         if self.upsample > 1 and self.variant == "release":
-            raise OptionError(f"{who}: upsample must be 1 in the variant 'release'; got {self.upsample}")
+            raise OptionError(f"VoxelSettings: upsample must be 1 in the variant 'release'; got {self.upsample}")
 
 
 @dataclass(frozen=True)
@@ -132,62 +193,34 @@ class DepthSettings(MachineSettings):
     far: float = 3.0
     planes: int = 64
     map_stride: int = 4
-    projection: str = "nearest"
+    projection: Literal["nearest", "trilinear"] = "nearest"
     ray_channels: tuple[int, ...] = (512, 128)
     skips: bool = True
 
-    def check(self, who: str) -> None:
-        """Raise an `OptionError` that names the first impossible setting."""
-        super().check(who)
-        near, far = (check_number(who, name, getattr(self, name), "a depth") for name in ("near", "far"))
-        if not 0 < near < far:
-            raise OptionError(f"{who}: near and far must be depths with 0 < near < far; got {near} and {far}")
-        check_whole(who, "planes", self.planes, 2, LARGEST_SIDE)
-        check_stride(who, "map_stride", self.map_stride, len(self.encoder_channels))
-        check_choice(who, "projection", self.projection, ("nearest", "trilinear"))
-        check_channels(who, "ray_channels", self.ray_channels)
-        check_flag(who, "skips", self.skips)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        who = type(self).__name__
+        if not self.near < self.far:
+            raise OptionError(f"{who}: near must be less than far = {self.far}; got {self.near}")
+        self._check_stride("map_stride")
         if len(self.ray_channels) != (1 if self.variant == "release" else 2):
             raise OptionError(
                 f"{who}: ray_channels must be two numbers, or one in the variant 'release'; got {self.ray_channels}"
             )
 
 
-Settings = TypeVar("Settings")
-
-
-def changed(who: str, settings: Settings, changes: Mapping[str, Any]) -> Settings:
-    """Settings with changes, checked; lists, as JSON has them, become tuples.
+def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:
+    """Settings with changes.
 
     Args:
-        who: the model, named in errors.
-        settings: to begin with, a dataclass with a method ``check(who)``.
+        settings: a dataclass that checks itself.
         changes: by name.
 
     Raises:
         OptionError: an unknown name, or an impossible value.
     """
-    names = [field.name for field in fields(settings)]  # type: ignore[arg-type]
+    names = [item.name for item in fields(settings)]  # type: ignore[arg-type]
     for name in changes:
         if name not in names:
-            close = get_close_matches(str(name), names, 1)
-            hint = f"; is {close[0]!r} meant?" if close else f"; there are {', '.join(names)}"
-            raise OptionError(f"{who}: there is no setting {name!r}{hint}")
-    new: Any = replace(settings, **{name: tuple(v) if isinstance(v, list) else v for name, v in changes.items()})  # type: ignore[type-var]
-    new.check(who)
-    return new
-
-
-def check_channels(who: str, name: str, value: object) -> None:
-    """Require one to eight numbers of channels."""
-    if not isinstance(value, tuple) or not 1 <= len(value) <= 8:
-        raise OptionError(f"{who}: {name} must be one to eight whole numbers; got {describe(value)}")
-    for item in value:
-        check_whole(who, name, item, 1, LARGEST_SIDE)
-
-
-def check_stride(who: str, name: str, value: object, levels: int) -> None:
-    """Require the stride of one of the image encoder's levels."""
-    strides = [2 << level for level in range(levels)]
-    if check_whole(who, name, value, 1) not in strides:
-        raise OptionError(f"{who}: {name} must be one of {', '.join(map(str, strides))}; got {value}")
+            raise OptionError(f"{type(settings).__name__}: there is no setting {name!r}{nearest(name, names)}")
+    return replace(settings, **changes)  # type: ignore[type-var]

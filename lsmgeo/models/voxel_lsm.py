@@ -7,12 +7,12 @@ from typing import Any
 
 from torch import Tensor
 
-from lsmgeo._checks import check_flag
 from lsmgeo.cameras.tensors import Cameras
 from lsmgeo.grids import VoxelGrid
 from lsmgeo.models.blocks import Block, interleave
-from lsmgeo.models.machine import Machine, evaluating
-from lsmgeo.models.outputs import VoxelOutput, VoxelResult
+from lsmgeo.models.machine import Machine
+from lsmgeo.models.model import VoxelModel
+from lsmgeo.models.outputs import VoxelOutput
 from lsmgeo.models.settings import VoxelSettings, changed
 
 __all__ = ["VoxelLSM"]
@@ -20,7 +20,7 @@ __all__ = ["VoxelLSM"]
 PAPER = VoxelSettings()
 
 
-class VoxelLSM(Machine):
+class VoxelLSM(Machine, VoxelModel):
     """The Voxel Learnt Stereo Machine: any number of images with cameras to occupancy of the cube [-0.5, 0.5]^3.
 
     A shared UNet makes features of each image; they are unprojected into the grid, with depth and ray direction as
@@ -57,10 +57,9 @@ class VoxelLSM(Machine):
     """
 
     name = "voxel-lsm"
-    output = "voxels"
 
     def __init__(self, settings: VoxelSettings = PAPER, **changes: Any) -> None:
-        settings = changed(self.name, settings, changes)
+        settings = changed(settings, changes)
         super().__init__(settings)
         self.settings = settings
         is_release = settings.variant == "release"
@@ -99,26 +98,3 @@ class VoxelLSM(Machine):
         if self.settings.upsample > 1:
             logits = interleave(logits, self.settings.upsample)
         return VoxelOutput(logits.squeeze(1).unflatten(0, grids.shape[:2]))
-
-    def run(
-        self, images: Tensor, cameras: Cameras, view_mask: Tensor | None = None, *, by_view: bool = True
-    ) -> VoxelResult:
-        """Probabilities of occupancy, in evaluation mode and without gradients.
-
-        Args:
-            images: (B, V, 3, H, W) in [0, 1].
-            cameras: B*V cameras.
-            view_mask: (B, V) bool.
-            by_view: whether to tell what is known after every view too, at V times the work of the last networks.
-
-        Returns:
-            `VoxelResult`, float32.
-
-        Raises:
-            ShapeError, DTypeError, DeviceError, CameraError, OptionError: see `lsmgeo.errors`.
-        """
-        check_flag(self.name, "by_view", by_view)
-        with evaluating(self):
-            logits = self(images, cameras, view_mask, steps=None if by_view else "last").logits
-            occupancy = logits.float().sigmoid()
-        return VoxelResult(occupancy[:, -1], occupancy if by_view else None)

@@ -122,7 +122,7 @@ def load(path: str | os.PathLike[str]) -> Model:
         path: as for `read_weights`.
 
     Returns:
-        The model, on the CPU, in evaluation mode.
+        The model, on the CPU, in evaluation mode; its `about` are the notes kept with the weights.
 
     Raises:
         CheckpointError: there is no such file, it is damaged, or it does not hold what its settings describe.
@@ -139,6 +139,7 @@ def load(path: str | os.PathLike[str]) -> Model:
     model.load_state_dict(
         {name: tensor.to(dtypes[name], copy=True) for name, tensor in weights.tensors.items()}, assign=True
     )
+    model.about = weights.about
     return model.eval()
 
 

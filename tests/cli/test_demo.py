@@ -1,5 +1,6 @@
 """``lsmgeo demo`` and what the command line does before a command runs."""
 
+import os
 import re
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from PIL import Image
 
 from lsmgeo import cli
 from lsmgeo.demo import run_demo
+from tests.models.training.faults import in_child
 
 
 def test_the_demo_recovers_the_depth_and_draws_it(tmp_path, capsys):
@@ -118,6 +120,20 @@ def test_an_interrupted_demo_leaves_nothing(tmp_path, monkeypatch, capsys):
     assert cli.main(["demo", "--out", str(tmp_path / "out")]) == 130
     assert capsys.readouterr().err == "lsmgeo: interrupted\n"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_reader_that_has_read_enough_ends_a_command_quietly(capfd):
+    """As head does."""
+
+    def ask_for_help():
+        reading, writing = os.pipe()
+        os.close(reading)
+        os.dup2(writing, 1)
+        sys.stdout = open(1, "w", closefd=False)
+        raise SystemExit(cli.main(["--help"]))
+
+    assert in_child(ask_for_help, quiet=False) == 141
+    assert capfd.readouterr().err == ""
 
 
 def interrupt(*_, **__):

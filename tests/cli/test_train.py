@@ -64,7 +64,7 @@ def test_a_signal_is_told_by_the_exit_status(configuration, tmp_path, capsys, mo
         (["--set", "run.stepz=3"], "there is no run.stepz; did you mean run.steps?"),
         (["--set", "data.source=/nowhere"], "/nowhere: cannot be read"),
         (["--set", "model.preset=huge"], "preset must be one of"),
-        (["--set", "model.settings.grid_sise=8"], "there is no setting 'grid_sise'; is 'grid_size' meant?"),
+        (["--set", "model.settings.grid_sise=8"], "there is no setting 'grid_sise'; did you mean grid_size?"),
         (["--set", "model.settings.upsample=1"], "no voxels at the model's resolution 8"),
         (["--set", "model.name=depth-lsm", "--set", "model.settings={}"], "source has no depth"),
     ],

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from lsmgeo.errors import OptionError
 from lsmgeo.models.blocks import Block, Convolution, InstanceNorm
 
 # Kernel, stride, what TensorFlow's "SAME" puts before and after a side of 8.
@@ -82,17 +81,17 @@ def test_even_kernels_of_stride_2_keep_maps_in_place(kernel_size, is_aligned):
 
 @pytest.mark.parametrize("scale", [True, False])
 def test_instance_norm_normalises_each_channel_of_each_sample(scale):
-    module = InstanceNorm(3, scale=scale, eps=0.25).double()
+    module = InstanceNorm(3, scale=scale).double()
     torch.nn.init.normal_(module.bias, generator=torch.Generator().manual_seed(1))
     if scale:
         torch.nn.init.normal_(module.weight, generator=torch.Generator().manual_seed(2))
     assert ("weight" in module.state_dict()) == scale
-    x = torch.randn(2, 3, 4, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    x = 0.01 * torch.randn(2, 3, 4, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
     expected = np.empty(x.shape)
     for n, c in np.ndindex(2, 3):
         pixels = x[n, c].numpy()
         gain = module.weight[c].item() if scale else 1.0
-        expected[n, c] = gain * (pixels - pixels.mean()) / np.sqrt(pixels.var() + 0.25) + module.bias[c].item()
+        expected[n, c] = gain * (pixels - pixels.mean()) / np.sqrt(pixels.var() + 1e-5) + module.bias[c].item()
     np.testing.assert_allclose(module(x).detach().numpy(), expected, rtol=1e-12, atol=1e-13)
 
 
@@ -103,5 +102,3 @@ def test_a_block_activates_first():
     assert torch.equal(block(x).detach(), x.relu())
     block.activate = False
     assert torch.equal(block(x).detach(), x)
-    with pytest.raises(OptionError, match="norm must be one of"):
-        Block(2, 1, 1, 1, norm="batch")

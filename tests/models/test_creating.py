@@ -9,8 +9,7 @@ import torch
 
 from lsmgeo.errors import DTypeError, OptionError
 from lsmgeo.models import Model, create, from_settings, settings_of
-from lsmgeo.models.creating import MODELS
-from lsmgeo.models.presets import PRESETS
+from lsmgeo.models.creating import MODELS, PRESETS
 from tests.models.inputs import look
 
 # So that a change of a preset's weights, which makes files of weights useless, is seen.
@@ -84,7 +83,10 @@ def test_every_model_has_the_four_presets():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: create("voxels-lsm"), r"name must be one of .*; got str 'voxels-lsm' \(is 'voxel-lsm' meant\?\)"),
+        (
+            lambda: create("voxels-lsm"),
+            r"name must be one of the models; got str 'voxels-lsm'; did you mean voxel-lsm\?",
+        ),
         (lambda: create("voxel-lsm", preset="small"), "preset must be one of 'paper', 'compact', 'standard', 'tiny'"),
         (lambda: create("voxel-lsm", variant="original"), "variant must be one of 'paper', 'release'"),
         (
@@ -92,26 +94,36 @@ def test_every_model_has_the_four_presets():
             "variant 'release' is for .* of preset 'paper'",
         ),
         (lambda: create("r2n2", variant="release"), "variant 'release' is for"),
-        (lambda: create("voxel-lsm", preset="tiny", hiden_channels=4), "is 'hidden_channels' meant"),
+        (
+            lambda: create("voxel-lsm", preset="tiny", hiden_channels=4),
+            r"there is no setting 'hiden_channels'; did you mean hidden_channels\?",
+        ),
         (lambda: create("voxel-lsm", preset="tiny", planes=4), "there is no setting 'planes'"),
         (lambda: create("voxel-lsm", preset="tiny", image_size=30), "image_size must be a multiple of 4"),
         (lambda: create("voxel-lsm", preset="tiny", image_size=4), "and twice that at least; got 4"),
         (lambda: create("voxel-lsm", preset="tiny", grid_size=4), "grid_size must be a multiple of 4"),
         (lambda: create("voxel-lsm", preset="tiny", feature_stride=3), "feature_stride must be one of 2, 4"),
-        (lambda: create("voxel-lsm", preset="tiny", encoder_channels=()), "encoder_channels must be one to eight"),
+        (
+            lambda: create("voxel-lsm", preset="tiny", encoder_channels=()),
+            r"encoder_channels must be tuple\[int, ...\]",
+        ),
+        (lambda: create("r2n2", preset="tiny", decoder=[4] * 65), r"decoder must be tuple\[int, ...\], from 1 to 4096"),
         (
             lambda: create("voxel-lsm", preset="tiny", encoder_channels=(8, 0)),
-            "encoder_channels must be a whole number",
+            r"encoder_channels must be tuple\[int, ...\], from 1 to 4096; got tuple \(8, 0\)",
         ),
-        (lambda: create("voxel-lsm", preset="tiny", fusion="mean"), "fusion must be one of 'gru', 'lstm'"),
-        (lambda: create("voxel-lsm", preset="tiny", grid_skip=1), "grid_skip must be True or False"),
+        (
+            lambda: create("voxel-lsm", preset="tiny", fusion="mean"),
+            r"fusion must be Literal\['gru', 'lstm'\]; got str 'mean'",
+        ),
+        (lambda: create("voxel-lsm", preset="tiny", grid_skip=1), "grid_skip must be bool; got int 1"),
         (lambda: create("voxel-lsm", variant="release", upsample=2), "upsample must be 1 in the variant 'release'"),
-        (lambda: create("depth-lsm", preset="tiny", near=3.0), "0 < near < far; got 3.0 and 3.0"),
-        (lambda: create("depth-lsm", preset="tiny", planes=1), "planes must be a whole number"),
+        (lambda: create("depth-lsm", preset="tiny", near=3.0), "near must be less than far = 3.0; got 3.0"),
+        (lambda: create("depth-lsm", preset="tiny", planes=1), "planes must be int, from 2 to 4096; got int 1"),
         (lambda: create("depth-lsm", preset="tiny", ray_channels=(8,)), "ray_channels must be two numbers"),
         (lambda: create("depth-lsm", preset="tiny", map_stride=8), "map_stride must be one of 2, 4"),
-        (lambda: create("depth-lsm", preset="tiny", projection="cubic"), "projection must be one of"),
-        (lambda: create("depth-lsm", preset="tiny", skips="yes"), "skips must be True or False"),
+        (lambda: create("depth-lsm", preset="tiny", projection="cubic"), "projection must be Literal"),
+        (lambda: create("depth-lsm", preset="tiny", skips="yes"), "skips must be bool; got str 'yes'"),
         (lambda: from_settings({"image_size": 32}), "settings must have a 'name'"),
         (lambda: from_settings({"name": "v-lsm"}), "name must be one of"),
         (lambda: from_settings({"name": "voxel-lsm", "channels": 3}), "there is no setting 'channels'"),

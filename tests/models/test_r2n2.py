@@ -253,9 +253,9 @@ def test_a_rotation_has_one_quaternion():
         ({"channels": ()}, "channels must be"),
         ({"shortcuts": ("none",)}, "shortcuts must be one for each"),
         ({"shortcuts": ("none", "identity", "none")}, "where channels change"),
-        ({"shortcuts": ("none", "none", "other")}, "shortcuts must be one of"),
-        ({"features": 0}, "features must be a whole number"),
-        ({"pose": 1}, "pose must be True or False"),
+        ({"shortcuts": ("none", "none", "other")}, "shortcuts must be .*'none', 'convolution', 'identity'"),
+        ({"features": 0}, "features must be int, from 1 to 65536; got int 0"),
+        ({"pose": 1}, "pose must be bool; got int 1"),
     ],
 )
 def test_impossible_settings_are_named(change, message):

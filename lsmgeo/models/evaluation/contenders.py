@@ -139,14 +139,14 @@ def open_contenders(checkpoints: str, device: str | torch.device = "cpu") -> lis
         OptionError: nothing is named, or two models are named alike.
         CheckpointError: a model cannot be read.
     """
-    from lsmgeo.models.weights import load, read_weights
+    from lsmgeo.models.weights import load
 
     found: list[Contender] = []
     for item in filter(None, (part.strip() for part in checkpoints.split(","))):
         match = re.fullmatch(r"([^=/\\]+)=(.+)", item)
         path = Path(match[2] if match else item)
         model = load(path).to(device).eval()
-        training = read_training(read_weights(path).about)
+        training = read_training(model.about)
         plain = f"{TITLES.get(str(model.name), str(model.name))} {training.words}".strip()
         found.append(Contender(match[1].strip() if match else plain, model, training, str(path)))
     if not found:

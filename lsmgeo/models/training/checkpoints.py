@@ -23,7 +23,6 @@ import torch
 from torch import Tensor, nn
 
 import lsmgeo
-from lsmgeo._checks import check_whole
 from lsmgeo.data.files import atomic_folder, clear_leftovers, remove_folder, write_atomic
 from lsmgeo.errors import CheckpointError, DataError, OptionError
 from lsmgeo.models.weights import (
@@ -135,7 +134,6 @@ def save_checkpoint(
         OptionError: the state or the configuration holds what a checkpoint cannot.
     """
     folder = Path(folder)
-    step, keep = check_whole("save_checkpoint", "step", step, 0), check_whole("save_checkpoint", "keep", keep, 1)
     final = folder / step_folder(step)
     about = {"step": step, "training": json.loads(_canonical(config)), **(about or {})}
     files = {WEIGHTS: encode_weights(model, about=about), STATE: _encode_state(state)}

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import difflib
 import json
+import math
 import os
 import tomllib
-import types
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal
 
-from lsmgeo._checks import check_choice, check_flag, check_number, check_whole, describe
+from lsmgeo._checks import describe
 from lsmgeo.data.files import read_text
 from lsmgeo.errors import DataError, OptionError
-from lsmgeo.models.losses import LOSSES
+from lsmgeo.models.settings import check_settings, nearest
 
 __all__ = ["DataConfig", "ModelConfig", "OptimiserConfig", "RunConfig", "TrainingConfig", "make_config", "read_config"]
 
 MAX_BYTES = 1 << 20
+WHOLE = (1, 2**63 - 1)
+SHARE = (0, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +40,9 @@ class ModelConfig:
     variant: str = "paper"
     settings: Mapping[str, Any] = field(default_factory=dict)
     weights: str | None = None
+
+    def __post_init__(self) -> None:
+        check_settings("model", self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,24 +81,18 @@ class DataConfig:
     limit: int | None = None
     pose_noise: float = 0.0
     workers: int = 1
-    on_error: str = "raise"
+    on_error: Literal["raise", "skip"] = "raise"
     max_bad_fraction: float = 0.001
 
     def __post_init__(self) -> None:
-        for name, least in (("shapes", 1), ("set_seed", 0), ("pool", 1), ("workers", 0)):
-            check_whole("data", name, getattr(self, name), least, 2**32 - 1)
+        seeds = (0, 2**32 - 1)
+        limits = {"set_seed": seeds, "workers": seeds, "background": SHARE, "max_bad_fraction": SHARE}
+        check_settings("data", self, (1, 2**32 - 1), pose_noise=(0, 180), **limits)
         low, high = self.view_range
-        if not 1 <= check_whole("data", "views", low, 1) <= check_whole("data", "views", high, 1):
+        if not low <= high:
             raise OptionError(f"data: views must be a number or [low, high], low <= high; got {self.views!r}")
-        if self.limit is not None:
-            check_whole("data", "limit", self.limit, 1)
         if self.source == "synthetic-13" and high > self.pool:
             raise OptionError(f"data: views must be at most data.pool = {self.pool}; got {self.views!r}")
-        check_choice("data", "on_error", self.on_error, ("raise", "skip"))
-        if not 0 <= check_number("data", "pose_noise", self.pose_noise, "degrees") <= 180:
-            raise OptionError(f"data: pose_noise must be degrees from 0 to 180; got {self.pose_noise!r}")
-        if not 0 <= check_number("data", "max_bad_fraction", self.max_bad_fraction, "a share in [0, 1]") <= 1:
-            raise OptionError(f"data: max_bad_fraction must be a share in [0, 1]; got {self.max_bad_fraction!r}")
 
     @property
     def view_range(self) -> tuple[int, int]:
@@ -118,20 +116,13 @@ class OptimiserConfig:
     learning_rate: float = 1e-3
     betas: tuple[float, float] = (0.9, 0.999)
     weight_decay: float = 0.0
-    schedule: str = "constant"
+    schedule: Literal["constant", "cosine"] = "constant"
     warm_up: int = 0
     clip_norm: float | None = None
 
     def __post_init__(self) -> None:
-        check_choice("optimiser", "schedule", self.schedule, ("constant", "cosine"))
-        check_whole("optimiser", "warm_up", self.warm_up, 0)
-        for name in ("learning_rate", "clip_norm"):
-            value = getattr(self, name)
-            if value is not None and not check_number("optimiser", name, value, "a positive number") > 0:
-                raise OptionError(f"optimiser: {name} must be a positive number; got {value!r}")
-        if not check_number("optimiser", "weight_decay", self.weight_decay, "a number, at least 0") >= 0:
-            raise OptionError(f"optimiser: weight_decay must be a number, at least 0; got {self.weight_decay!r}")
-        if not all(0 <= check_number("optimiser", "betas", beta, "two numbers in [0, 1)") < 1 for beta in self.betas):
+        check_settings("optimiser", self, warm_up=(0, 2**63 - 1), weight_decay=(0, math.inf), betas=SHARE)
+        if max(self.betas) == 1:
             raise OptionError(f"optimiser: betas must be two numbers in [0, 1); got {self.betas!r}")
 
 
@@ -176,12 +167,12 @@ class RunConfig:
     seed: int = 0
     batch: int = 4
     accumulation: int = 1
-    device: str = "auto"
-    precision: str = "no"
+    device: Literal["auto", "cpu"] = "auto"
+    precision: Literal["auto", "no", "bf16", "fp16"] = "no"
     channels_last: bool | None = None
-    loss: str = "bce"
-    loss_views: str = "every"
-    region: str = "object"
+    loss: Literal["bce", "bce+iou"] = "bce"
+    loss_views: Literal["every", "random", "last"] = "every"
+    region: Literal["object", "all"] = "object"
     evaluate_every: int = 500
     evaluate_shapes: int = 52
     evaluate_views: int | None = None
@@ -194,28 +185,7 @@ class RunConfig:
     max_bad_fraction: float = 0.001
 
     def __post_init__(self) -> None:
-        least = {"seed": 0, "pictures": 0}
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if "int" in str(item.type) and not (value is None and "None" in str(item.type)):
-                check_whole("run", item.name, value, least.get(item.name, 1))
-        for name, choices in (
-            ("device", ("auto", "cpu")),
-            ("precision", ("auto", "no", "bf16", "fp16")),
-            ("loss", LOSSES),
-            ("loss_views", ("every", "random", "last")),
-            ("region", ("object", "all")),
-        ):
-            check_choice("run", name, getattr(self, name), choices)
-        check_flag("run", "tensorboard", self.tensorboard)
-        if self.channels_last is not None:
-            check_flag("run", "channels_last", self.channels_last)
-        for name in ("minutes", "cpu_minutes"):
-            value = getattr(self, name)
-            if value is not None and not check_number("run", name, value, "a positive number") > 0:
-                raise OptionError(f"run: {name} must be a positive number; got {value!r}")
-        if not 0 <= check_number("run", "max_bad_fraction", self.max_bad_fraction, "a share in [0, 1]") <= 1:
-            raise OptionError(f"run: max_bad_fraction must be a share in [0, 1]; got {self.max_bad_fraction!r}")
+        check_settings("run", self, WHOLE, seed=(0, 2**63 - 1), pictures=(0, 2**63 - 1), max_bad_fraction=SHARE)
         if self.steps is None and self.minutes is None and self.cpu_minutes is None:
             raise OptionError("run: steps, minutes or cpu_minutes must say when the run ends; got none")
 
@@ -294,20 +264,16 @@ def make_config(values: Mapping[str, Any]) -> TrainingConfig:
         raise OptionError(f"a configuration must be a table of groups; got {describe(values)}")
     known = [f"{group}.{item.name}" for group, form in GROUPS.items() for item in fields(form)]
     groups = {}
-    for group, content in values.items():
+    # A run without settings says that steps or minutes are missing.
+    for group, content in {"run": {}, **values}.items():
         if group not in GROUPS:
             raise OptionError(f"there is no group {group!r}{_nearest(group, [*GROUPS, *known])}")
         if not isinstance(content, Mapping):
             raise OptionError(f"{group} must be a table of settings; got {describe(content)}")
-        hints = get_type_hints(GROUPS[group])
         for key in content:
-            if key not in hints:
+            if f"{group}.{key}" not in known:
                 raise OptionError(f"there is no {group}.{key}{_nearest(f'{group}.{key}', known)}")
-        groups[group] = GROUPS[group](
-            **{key: _converted(f"{group}.{key}", value, hints[key]) for key, value in content.items()}
-        )
-    if "run" not in groups:
-        groups["run"] = RunConfig()  # says that steps or minutes are missing
+        groups[group] = GROUPS[group](**content)
     return TrainingConfig(**groups)
 
 
@@ -364,38 +330,4 @@ def _parsed(text: str) -> Any:
 def _nearest(key: str, known: Sequence[str]) -> str:
     # The right name in the wrong group comes before a like one in the right group.
     near = [name for name in known if "." in key and name.rpartition(".")[2] == key.rpartition(".")[2]]
-    near = near or difflib.get_close_matches(key, known, 1, 0.6)
-    return f"; did you mean {near[0]}?" if near else f"; there are {', '.join(known)}"
-
-
-def _converted(key: str, value: Any, hint: Any) -> Any:
-    """A value of JSON or TOML as the kind of a setting: lists become tuples, whole numbers real ones."""
-    kinds = get_args(hint) if get_origin(hint) in (types.UnionType, Union) else (hint,)
-    for kind in kinds:
-        origin = get_origin(kind) or kind
-        if origin is tuple and isinstance(value, (list, tuple)):
-            inner = get_args(kind)
-            inner = inner[:1] * len(value) if inner[-1] is Ellipsis else inner
-            if len(inner) == len(value):
-                return tuple(_converted(key, one, of) for one, of in zip(value, inner, strict=True))
-        elif origin is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-            return float(value)
-        elif origin is Mapping and isinstance(value, Mapping):
-            return dict(value)
-        elif origin is bool or not isinstance(value, bool):
-            if origin is type(None):
-                if value is None:
-                    return None
-            elif isinstance(origin, type) and isinstance(value, origin):
-                return value
-    raise OptionError(f"{key} must be {' or '.join(map(_spelt, kinds))}; got {describe(value)}")
-
-
-def _spelt(kind: Any) -> str:
-    names = {int: "a whole number", float: "a number", str: "text", bool: "true or false", type(None): "none"}
-    if kind in names:
-        return names[kind]
-    origin, inner = get_origin(kind), get_args(kind)
-    if origin is tuple:
-        return f"a list of {_spelt(inner[0])}" if inner[-1] is Ellipsis else f"a list of {len(inner)} numbers"
-    return "a table"
+    return f"; did you mean {near[0]}?" if near else nearest(key, known)

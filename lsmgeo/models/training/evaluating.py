@@ -14,7 +14,7 @@ from lsmgeo.cameras import CameraTensors
 from lsmgeo.data import Batch, Sample
 from lsmgeo.metrics import DepthError, VoxelIoU
 from lsmgeo.models.losses import sum_loss
-from lsmgeo.models.machine import evaluating
+from lsmgeo.models.model import evaluating
 from lsmgeo.models.training.pictures import Example
 from lsmgeo.models.training.processes import any_true, gather
 from lsmgeo.models.training.signals import StopRequest
@@ -88,7 +88,6 @@ def evaluate_model(
     measures: dict[int, Any] = {}
     total = count = 0.0
     examples: list[Example] = []
-    kind = "iou"
     with evaluating(model):
         for batch in batches:
             if stop:
@@ -97,28 +96,25 @@ def evaluate_model(
             terms, number = sum_loss(output, batch, region=region, loss=loss)
             total, count = total + float(terms), count + float(number)
             names = [name or "all" for name in batch.category]
-            if hasattr(output, "logits"):
-                predicted = output.logits.float().sigmoid()
-                for view in range(predicted.shape[1]):
-                    measure = measures.setdefault(view + 1, VoxelIoU())
-                    measure.update(predicted[:, view], batch.occupancy, names)
-            else:
-                kind, predicted = "depth_error", output.depth.float()
-                for view in range(predicted.shape[1]):
-                    measure = measures.setdefault(view + 1, DepthError())
-                    measure.update(predicted[:, view], batch.depth, names, batch.mask)
+            has_depth = hasattr(output, "depth")
+            predicted = output.depth.float() if has_depth else output.logits.float().sigmoid()
+            for view, of_view in enumerate(predicted.unbind(1), 1):
+                if has_depth:
+                    measures.setdefault(view, DepthError()).update(of_view, batch.depth, names, batch.mask)
+                else:
+                    measures.setdefault(view, VoxelIoU()).update(of_view, batch.occupancy, names)
             for index in range(min(pictures - len(examples), len(predicted))):
                 examples.append(Example(_sample(batch, index), predicted[index].cpu()))
     if any_true(bool(stop)):
         return None
-    parts = gather((measures, total, count, kind))
+    parts = gather((measures, total, count))
     together, *others = [part[0] for part in parts if part[0]]  # a process may have had no shape
     for other in others:
         for view, measure in other.items():
             together[view].merge(measure)
     means = {view: measure.compute() for view, measure in sorted(together.items())}
     return Evaluation(
-        measure=next(part[3] for part in parts if part[0]),
+        measure="depth_error" if isinstance(together[1], DepthError) else "iou",
         by_view={view: found.mean for view, found in means.items()},
         categories=means[max(means)].categories,
         loss=sum(part[1] for part in parts) / max(1.0, sum(part[2] for part in parts)),

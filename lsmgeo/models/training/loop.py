@@ -7,24 +7,23 @@ import json
 import os
 import time
 import warnings
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from math import ceil, isfinite
 from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, Any
 
-from lsmgeo.data import Batch, write_atomic
+from lsmgeo.data import write_atomic
 from lsmgeo.errors import CheckpointError, TrainingError
 from lsmgeo.models.creating import settings_of
 from lsmgeo.models.training.checkpoints import Checkpoint, check_config, load_latest, save_checkpoint
 from lsmgeo.models.training.config import TrainingConfig
 from lsmgeo.models.training.evaluating import Evaluation, evaluate_model
 from lsmgeo.models.training.feeding import Need, open_shapes, training_batches, validation_batches
-from lsmgeo.models.training.guard import StepGuard
 from lsmgeo.models.training.logs import RunLog
 from lsmgeo.models.training.optimising import (
     TIMED_STEPS,
+    StepGuard,
     find_gradients,
     learning_rate,
     loss_steps,
@@ -330,27 +329,18 @@ def _train(
                 break
 
             begun, cpu_begun = time.monotonic(), time.process_time()
-            taken = fetch(batches, run.accumulation, stop)
+            # None as soon as a stop is asked for.
+            taken = [batch for _ in range(run.accumulation) if (batch := stop.next_item(batches)) is not None]
             waited = time.monotonic() - begun
-            if any_true(taken is None or bool(stop)):
+            if any_true(len(taken) < run.accumulation or bool(stop)):
                 ended = "stop"
                 continue
             if run.minutes is not None and any_true(begun - begin > 60 * run.minutes):
                 ended = "minutes"
                 continue
-            assert taken is not None
 
             after = loss_steps(run, place.step, most)
-            gradients = find_gradients(
-                wrapped,
-                taken,
-                optimiser,
-                accelerator,
-                steps=after,
-                region=run.region,
-                loss=run.loss,
-                terms=terms,
-            )
+            gradients = find_gradients(wrapped, taken, optimiser, accelerator, run, steps=after, terms=terms)
             place.step += 1
             hold = TIMED_STEPS if run.cpu_minutes is not None else 0
             rate = learning_rate(config.optimiser, place.moved, run.steps, hold=hold)
@@ -360,13 +350,8 @@ def _train(
                 place.moved += 1
             else:
                 names = [name for part in gather([name for batch in taken for name in batch.name]) for name in part]
-                log.event(
-                    "skipped",
-                    step=place.step,
-                    loss=gradients.loss,
-                    gradient_norm=gradients.norm,
-                    shapes=names,
-                )
+                numbers = {"loss": gradients.loss, "gradient_norm": gradients.norm}
+                log.event("skipped", step=place.step, **numbers, shapes=names)
                 log.say(f"step {place.step}: the loss or the gradient is not finite; skipped")
                 is_scaled = accelerator.scaler is not None and isfinite(gradients.loss)
                 scale = accelerator.scaler.get_scale() if is_scaled else None
@@ -406,14 +391,3 @@ def _train(
         )
     assert saved is not None
     return Trained(folder, place.step, saved, place.best, evaluation, ended, rank == 0, stop.exit_code)
-
-
-def fetch(batches: Iterator[Batch], count: int, stop: StopRequest) -> list[Batch] | None:
-    """The batches of a step; None as soon as a stop is asked for."""
-    taken: list[Batch] = []
-    while len(taken) < count:
-        batch = stop.next_item(batches)
-        if batch is None:
-            return None
-        taken.append(batch)
-    return taken

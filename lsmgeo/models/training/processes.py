@@ -46,7 +46,6 @@ def check_agreement(things: Mapping[str, object]) -> None:
         TrainingError: a thing differs; the message names it and the first process that differs.
     """
     for rank, others in enumerate(gather(dict(things))):
-        for name in sorted(things.keys() | others.keys()):
-            if things.get(name) != others.get(name):
-                own, other = things.get(name), others.get(name)
+        for name, own in things.items():
+            if own != (other := others[name]):
                 raise TrainingError(f"processes do not agree: {name} is {own!r} here and {other!r} in process {rank}")

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import os
 import signal
+import socket
 import sys
 import time
 import traceback
@@ -61,6 +62,22 @@ def wait(child: int, *, timeout: float = 120.0) -> int:
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     raise TimeoutError(f"the process hung for {timeout} s")
+
+
+def in_processes(work: Callable[[int], object], count: int = 2) -> list[int]:
+    """The exit codes of processes as `torchrun` starts them, each of which does the work."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+
+    def begin(rank: int) -> None:
+        names = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": count, "LOCAL_WORLD_SIZE": count}
+        os.environ |= {name: str(value) for name, value in names.items()}
+        os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "GLOO_SOCKET_IFNAME": "lo"}
+        work(rank)
+
+    children = [start(lambda rank=rank: begin(rank)) for rank in range(count)]
+    return [wait(child) for child in children]
 
 
 class Points:

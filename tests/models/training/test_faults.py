@@ -20,7 +20,7 @@ import torch
 from lsmgeo.errors import CheckpointError, TrainingError
 from lsmgeo.models.training import TrainingConfig, loop, optimising
 from lsmgeo.models.training import logs as log_module
-from tests.models.training.faults import Points, fill, in_child, kill, leftovers, start, wait
+from tests.models.training.faults import Points, fill, in_child, in_processes, kill, leftovers
 from tests.models.training.runs import assert_same_end, configure, end_of, events, losses, run, write_shapes
 
 KILLS = 14  # moments of a save at which a run is killed
@@ -327,54 +327,19 @@ def test_three_steps_in_a_row_end_the_run_which_loses_nothing(config, tmp_path, 
     assert end_of(tmp_path)[0] == 6
 
 
-def in_two_processes(port: int, work: Callable[[int], object]) -> list[int]:
-    """As `torchrun` starts them."""
-
-    def one(rank: int) -> None:
-        os.environ |= {
-            **{"RANK": str(rank), "LOCAL_RANK": str(rank), "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2"},
-            **{"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)},
-        }
-        work(rank)
-
-    return [wait(child) for child in [start(lambda rank=rank: one(rank)) for rank in range(2)]]
-
-
-@pytest.fixture
-def port() -> int:
-    import socket
-
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return listener.getsockname()[1]
-
-
-def test_a_loss_that_is_not_finite_in_one_process_is_skipped_by_both(config, shards, tmp_path, monkeypatch, port):
+def test_a_loss_that_is_not_finite_in_one_process_is_skipped_by_both(config, shards, tmp_path, monkeypatch):
     def work(rank: int) -> None:
         poison(monkeypatch, {2} if rank == 1 else set())
         trained = run(configure(shards, steps=3), tmp_path)
         assert (trained.step, trained.ended) == (3, "steps")
 
-    assert in_two_processes(port, work) == [0, 0]
+    assert in_processes(work) == [0, 0]
     assert numbers(tmp_path).isfinite().all()
     (skipped,) = events(tmp_path, "skipped")
     assert skipped["step"] == 2
     assert len(skipped["shapes"]) == 4
     with pytest.raises(CheckpointError, match="processes was 2 and is 1 now"):
         run(configure(shards, steps=4), tmp_path)
-
-
-def test_a_signal_to_one_process_stops_both_after_the_same_step(config, shards, tmp_path, monkeypatch, port):
-    def work(rank: int) -> None:
-        if rank == 1:
-            at_call(monkeypatch, loop, "find_gradients", 2, ask)
-        trained = run(configure(shards, checkpoint_every=1000), tmp_path)
-        assert (trained.step, trained.ended) == (2, "stop")
-        raise SystemExit(trained.exit_code)
-
-    codes = in_two_processes(port, work)
-    assert codes[1] == 143
-    assert end_of(tmp_path)[0] == 2
 
 
 # F8: folders that vanish or cannot be written

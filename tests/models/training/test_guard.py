@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from lsmgeo.errors import TrainingError
-from lsmgeo.models.training.guard import StepGuard
+from lsmgeo.models.training.optimising import StepGuard
 
 
 def test_one_bad_gradient_would_poison_adam_for_good():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
-import socket
 
 import pytest
 import torch
@@ -13,24 +12,8 @@ import torch
 from lsmgeo.errors import CheckpointError
 from lsmgeo.models.training import loop
 from lsmgeo.models.training.optimising import loss_steps
-from tests.models.training import faults
+from tests.models.training.faults import in_processes
 from tests.models.training.runs import configure, end_of, events, run, write_shapes
-
-
-def in_processes(work, count=2):
-    """The exit codes of processes as `torchrun` starts them, each of which does the work."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-
-    def begin(rank):
-        names = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": count, "LOCAL_WORLD_SIZE": count}
-        os.environ |= {name: str(value) for name, value in names.items()}
-        os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "GLOO_SOCKET_IFNAME": "lo"}
-        work(rank)
-
-    children = [faults.start(lambda rank=rank: begin(rank)) for rank in range(count)]
-    return [faults.wait(child) for child in children]
 
 
 @pytest.fixture(scope="module")
@@ -117,8 +100,9 @@ def test_a_stop_asked_of_one_process_stops_both(shards, together, tmp_path):
         loop.find_gradients = find_gradients
         trained = run(configure(shards, steps=3, batch=2), tmp_path)
         assert (trained.ended, trained.step) == ("stop", 1)
+        raise SystemExit(trained.exit_code)
 
-    assert in_processes(begin) == [0, 0]
+    assert in_processes(begin) == [0, 143]
     assert end_of(tmp_path)[0] == 1
     assert in_processes(lambda rank: run(configure(shards, steps=3, batch=2), tmp_path)) == [0, 0]
     torch.testing.assert_close(end_of(tmp_path)[1], end_of(together)[1], rtol=0, atol=0)

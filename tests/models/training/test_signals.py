@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader
 from lsmgeo.errors import TrainingError
 from lsmgeo.models.training.processes import any_true, check_agreement, gather
 from lsmgeo.models.training.signals import catch_stop, ignore_stop
-from tests.models.training.faults import in_child, start, wait
+from tests.models.training.faults import in_child, in_processes
 
 
 def ask(number: int = signal.SIGTERM) -> None:
@@ -170,17 +170,9 @@ def test_workers_outlive_a_signal_to_the_whole_group_and_end_with_the_run():
     assert in_child(work, timeout=30) == 143
 
 
-def in_two_processes(tmp_path, work) -> list[int]:
-    def one(rank: int) -> None:
-        torch.distributed.init_process_group("gloo", f"file://{tmp_path}/meeting", rank=rank, world_size=2)
-        work(rank)
-        torch.distributed.destroy_process_group()
-
-    return [wait(child, timeout=60) for child in [start(lambda rank=rank: one(rank)) for rank in range(2)]]
-
-
-def test_processes_agree(tmp_path):
+def test_processes_agree():
     def work(rank: int) -> None:
+        torch.distributed.init_process_group("gloo")
         assert any_true(rank == 1)
         assert not any_true(False)
         assert gather({"rank": rank}) == [{"rank": 0}, {"rank": 1}]
@@ -195,7 +187,7 @@ def test_processes_agree(tmp_path):
             assert any_true(bool(stop))
             assert not any_true(stop.signal is not None and rank == 0)
 
-    assert in_two_processes(tmp_path, work) == [0, 0]
+    assert in_processes(work) == [0, 0]
 
 
 def test_alone_every_answer_is_ones_own():

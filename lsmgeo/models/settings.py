@@ -19,7 +19,7 @@ __all__ = ["DepthSettings", "MachineSettings", "VoxelSettings", "changed", "chec
 
 LARGEST_SIDE = 4096
 LONGEST_LIST = 64
-NUMBERS: dict[Any, type] = {int: Integral, float: Real}
+NUMBERS: dict[Any, Any] = {int: Integral, float: Real}
 
 Settings = TypeVar("Settings")
 Limits = tuple[float, float]

@@ -47,8 +47,8 @@ MAY_ALSO_IMPORT = {
     "models": {"data", "scenes", "metrics", "classical"},
 }
 NETWORKS = {
-    "blocks", "creating", "depth_lsm", "grid_unet", "image_encoder", "losses", "machine", "model", "outputs", "presets",
-    "r2n2", "settings", "voxel_lsm",
+    "blocks", "creating", "depth_lsm", "grid_unet", "image_encoder", "losses", "machine", "model", "outputs", "r2n2",
+    "settings", "voxel_lsm",
 }  # fmt: skip
 HEAVY = {"cv2", "trimesh", "skimage", "matplotlib", "jsonargparse", "triton", "scipy", "tqdm", "PIL"}
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from itertools import zip_longest
 from math import prod
-from numbers import Integral, Real
-from typing import Any
+from numbers import Real
+from typing import Any, TypeGuard
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,6 +28,7 @@ __all__ = [
     "check_number",
     "check_size",
     "check_whole",
+    "is_whole",
     "moved",
 ]
 
@@ -133,10 +135,14 @@ def check_number(who: str, name: str, value: Any, expected: str) -> float:
     return float(value)
 
 
+def is_whole(value: Any) -> TypeGuard[int]:
+    """Whether a value is a whole number, Python's or numpy's; True and False are none."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
 def check_whole(who: str, name: str, value: Any, least: int, most: int = 2**63 - 1) -> int:
-    """Require a whole number, Python's or numpy's, in a range; return Python's."""
-    is_whole = isinstance(value, Integral) and not isinstance(value, bool)
-    if not is_whole or not least <= value <= most:
+    """Require a whole number (see `is_whole`) in a range; return Python's."""
+    if not is_whole(value) or not least <= value <= most:
         expected = (
             f"a whole number, at least {least}" if most == 2**63 - 1 else f"a whole number from {least} to {most}"
         )
@@ -146,20 +152,21 @@ def check_whole(who: str, name: str, value: Any, least: int, most: int = 2**63 -
 
 def check_size(who: str, name: str, value: Any, length: int, expected: str) -> tuple[int, ...]:
     """Require that many positive integers (an int alone stands for all of them where `length` is 3)."""
-    if isinstance(value, int) and not isinstance(value, bool) and length == 3:
+    if is_whole(value) and length == 3:
         value = (value,) * 3
     if (
         not isinstance(value, Sequence)
         or isinstance(value, str)
         or len(value) != length
-        or not all(isinstance(item, (int, torch.SymInt)) and not isinstance(item, bool) for item in value)
+        or not all(is_whole(item) or isinstance(item, torch.SymInt) for item in value)
     ):
         raise ShapeError(f"{who}: {name} must be {expected}; got {describe(value)}")
     if any(item < 1 for item in value):
         raise ShapeError(f"{who}: {name} must be {expected}, each at least 1; got {tuple(value)}")
-    if prod(value) > LARGEST_COUNT:
-        raise ShapeError(f"{who}: {name} must be {expected}, 2^31 - 1 cells at most; got {tuple(value)}")
-    return tuple(value)
+    sizes: tuple[int, ...] = tuple(item if isinstance(item, torch.SymInt) else int(item) for item in value)  # type: ignore[misc]
+    if prod(sizes) > LARGEST_COUNT:
+        raise ShapeError(f"{who}: {name} must be {expected}, 2^31 - 1 cells at most; got {sizes}")
+    return sizes
 
 
 def check_devices(who: str, **tensors: Tensor | None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["computing_dtype", "saturating_cast"]
+__all__ = ["computing_dtype", "saturating_cast", "saturation_limit"]
 
 
 def computing_dtype(values: Tensor) -> torch.dtype:
@@ -13,9 +13,15 @@ def computing_dtype(values: Tensor) -> torch.dtype:
     return torch.float64 if values.dtype == torch.float64 else torch.float32
 
 
+def saturation_limit(dtype: torch.dtype) -> float:
+    """What an output saturates beyond: what rounds to the dtype's largest finite value does not, gradients pass it."""
+    info = torch.finfo(dtype)
+    return info.max * (1.0 + info.eps / 8.0)
+
+
 def saturating_cast(values: Tensor, dtype: torch.dtype) -> Tensor:
     """Cast to a dtype of which the largest finite value stands for all above it: what is finite stays finite."""
     if values.dtype == dtype:
         return values
-    largest = torch.finfo(dtype).max
-    return values.clamp(-largest, largest).to(dtype)
+    limit = saturation_limit(dtype)
+    return values.clamp(-limit, limit).to(dtype)

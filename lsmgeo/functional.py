@@ -15,7 +15,15 @@ import torch
 from torch import Tensor
 
 from lsmgeo import kernels
-from lsmgeo._checks import check_choices, check_devices, check_flag, check_float, check_geometry, check_mask, describe
+from lsmgeo._checks import (
+    check_choices,
+    check_devices,
+    check_flag,
+    check_float,
+    check_geometry,
+    check_mask,
+    check_whole,
+)
 from lsmgeo._dtypes import computing_dtype, saturating_cast
 from lsmgeo._sites import Cameras, Grid, check_features, direction_matrix, image_matrices, image_sites, sweep_sites
 from lsmgeo.debugging import can_inspect
@@ -172,8 +180,7 @@ def unproject_slabs(
         [(1, 2, 1, 2, 5, 5), (1, 2, 1, 2, 5, 5), (1, 2, 1, 1, 5, 5)]
     """
     who = "unproject_slabs"
-    if not isinstance(planes, int) or isinstance(planes, bool) or planes < 1:
-        raise OptionError(f"{who}: planes must be an integer, at least 1; got {describe(planes)}")
+    check_whole(who, "planes", planes, 1)
     options = Options.checked(
         who,
         volume=False,

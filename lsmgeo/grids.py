@@ -22,6 +22,7 @@ from lsmgeo._checks import (
     check_number,
     check_size,
     describe,
+    is_whole,
     moved,
 )
 from lsmgeo._linalg import affine_inverse, basis_row, homogeneous_row, inverse_3x3, multiply
@@ -322,7 +323,8 @@ def depth_planes(near: float | Tensor, far: float | Tensor, num: int, spacing: s
         (num,) or (B, num), strictly ascending, differentiable in near and far.
 
     Raises:
-        GridError: near and far not positive and ascending, or no planes.
+        GridError: no planes; near and far not positive and ascending, or with fewer numbers of their dtype between
+            them than planes.
         OptionError: an unknown spacing.
 
     Example:
@@ -336,7 +338,7 @@ def depth_planes(near: float | Tensor, far: float | Tensor, num: int, spacing: s
     """
     who = "depth_planes"
     check_choice(who, "spacing", spacing, ("depth", "inverse", "log"))
-    if not isinstance(num, int) or isinstance(num, bool) or not 1 <= num <= LARGEST_NUMBER_OF_PLANES:
+    if not is_whole(num) or not 1 <= num <= LARGEST_NUMBER_OF_PLANES:
         raise GridError(f"{who}: num must be an integer from 1 to {LARGEST_NUMBER_OF_PLANES}; got {describe(num)}")
     given = [value for value in (near, far) if isinstance(value, Tensor)]
     like = given[0] if given else torch.zeros(())
@@ -360,14 +362,23 @@ def depth_planes(near: float | Tensor, far: float | Tensor, num: int, spacing: s
     first, last = torch.broadcast_tensors(*ends)
     if can_inspect(first) and not bool(((first > 0) & (first < last) & last.isfinite()).all()):
         raise GridError(f"{who}: near and far must be positive, finite and ascending; got {near} and {far}")
-    first, last = first[..., None], last[..., None]
-    a = torch.linspace(0.0, 1.0, num, dtype=first.dtype, device=first.device)
+    dtype, ends = first.dtype, [first[..., None], last[..., None]]
+    if num == 1:
+        return ends[0].clone()
+    first, last = (end.double() for end in ends)
+    a = torch.linspace(0.0, 1.0, num, dtype=torch.float64, device=first.device)
     if spacing == "depth":
         planes = first * (1.0 - a) + last * a
     elif spacing == "inverse":
         planes = 1.0 / ((1.0 - a) / first + a / last)
     else:
         planes = torch.exp((1.0 - a) * torch.log(first) + a * torch.log(last))
-    if num == 1:
-        return first.expand(planes.shape).clone()
-    return torch.cat((first, planes[..., 1:-1], last), -1)  # the ends exactly
+    planes = torch.cat((ends[0], planes[..., 1:-1].to(dtype), ends[1]), -1)  # the ends exactly
+    # Rounding may leave neighbours equal. Positive numbers are ordered as the integers of the same bits.
+    integers = {2: torch.int16, 4: torch.int32, 8: torch.int64}[planes.element_size()]
+    count = torch.arange(num, device=planes.device)
+    excess = planes.detach().view(integers).long() - count
+    if can_inspect(planes) and not bool((excess[..., 0] <= excess[..., -1]).all()):
+        raise GridError(f"{who}: near and far must be {num} different numbers of {dtype} apart; got {near} and {far}")
+    ascending = torch.minimum(excess.cummax(-1).values, excess[..., -1:]) + count
+    return planes + (ascending.to(integers).view(dtype) - planes.detach())

@@ -19,6 +19,7 @@ from lsmgeo._checks import (
     check_flag,
     check_float,
     check_size,
+    check_whole,
     describe,
     moved,
 )
@@ -29,6 +30,7 @@ from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
 from lsmgeo.functional import Names, Projected
 from lsmgeo.grids import VoxelGrid, check_constant_depths
 from lsmgeo.kernels.request import Options
+from lsmgeo.kernels.statistics import first_maximum
 
 __all__ = ["Composited", "ProjectReduce", "composite", "expected_depth", "max_along_rays", "project_reduce"]
 
@@ -128,7 +130,7 @@ def max_along_rays(maps: Tensor, visible: Tensor | None = None) -> Tensor:
         first = maps.detach().max(-3, keepdim=True).indices
         return maps.gather(-3, first).squeeze(-3)
     seen = visible.expand(maps.shape)
-    first = torch.where(seen, maps.detach(), -torch.inf).max(-3, keepdim=True).indices
+    first = first_maximum(maps, seen, -3)
     return torch.where(seen.any(-3), maps.gather(-3, first).squeeze(-3), 0.0)
 
 
@@ -345,8 +347,7 @@ class ProjectReduce(nn.Module):
         )
         kernels.check_backend(who, backend)
         for name, value in (("in_channels", in_channels), ("out_channels", out_channels)):
-            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-                raise OptionError(f"{who}: {name} must be an integer, at least 1; got {describe(value)}")
+            check_whole(who, name, value, 1)
         if not isinstance(grid, VoxelGrid):
             raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
         check_constant_depths(who, depths)

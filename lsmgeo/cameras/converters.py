@@ -147,7 +147,9 @@ def from_opencv(
     t = _matrix(who, "translation", translation, 3)
     looks_like_matrices = tuple(rotation.shape[-2:]) == (3, 3)
     if looks_like_matrices and rotation.shape == t.shape and can_inspect(rotation):
-        turned = multiply(rotation, rotation.transpose(-1, -2)) - torch.eye(3, dtype=rotation.dtype)
+        turned = multiply(rotation, rotation.transpose(-1, -2)) - torch.eye(
+            3, dtype=rotation.dtype, device=rotation.device
+        )
         if bool((turned.abs() <= 1e-3).all()):
             raise CameraError(
                 f"{who}: rotation must not be three vectors and a matrix at once; expand matrices to the translation's "

@@ -9,7 +9,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from lsmgeo._checks import GEOMETRY, LARGEST_COUNT, check_devices, check_geometry, describe
+from lsmgeo._checks import GEOMETRY, LARGEST_COUNT, check_devices, check_geometry, describe, is_whole
 from lsmgeo._linalg import multiply
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, DTypeError, ShapeError
@@ -120,11 +120,14 @@ def as_tensors(cameras: Cameras, who: str = "cameras") -> CameraTensors:
 
 def image_sizes(cameras: CameraTensors) -> tuple[Tensor, Tensor]:
     """Heights and widths as tensors, which they are after `as_tensors`."""
-    return torch.as_tensor(cameras.height), torch.as_tensor(cameras.width)
+    height, width = cameras.height, cameras.width
+    assert isinstance(height, Tensor)
+    assert isinstance(width, Tensor)
+    return height, width
 
 
 def _size(who: str, name: str, value: Any, leading: tuple[int, ...], like: Tensor) -> Tensor:
-    if isinstance(value, int) and not isinstance(value, bool):
+    if is_whole(value):
         if not 1 <= value <= LARGEST_COUNT:
             raise CameraError(f"{who}: cameras.{name} must be at least 1 pixel, 2^31 - 1 at most; got {value}")
         return torch.full(leading, value, dtype=torch.int64, device=like.device)
@@ -220,10 +223,10 @@ def stack(cameras: Sequence[Cameras], dim: int = 0) -> CameraTensors:
     leading = [tuple(part.cam_from_world.shape[:-2]) for part in parts]
     if len(set(leading)) > 1:
         raise ShapeError(f"stack: cameras must have one leading shape; got {leading}")
-    if not isinstance(dim, int) or isinstance(dim, bool) or not 0 <= dim <= len(leading[0]):
+    if not is_whole(dim) or not 0 <= dim <= len(leading[0]):
         raise ShapeError(f"stack: dim must be 0 to {len(leading[0])}; got {describe(dim)}")
     check_devices("stack", **{f"cameras[{i}]": part.intrinsics for i, part in enumerate(parts)})
-    fields = (torch.stack([torch.as_tensor(field) for field in column], dim) for column in zip(*parts, strict=True))
+    fields = (torch.stack(column, dim) for column in zip(*parts, strict=True))
     return CameraTensors(*fields)
 
 
@@ -250,11 +253,12 @@ def select(cameras: Cameras, dim: int, index: int) -> CameraTensors:
     """
     tensors = as_tensors(cameras, "select")
     leading = tuple(tensors.cam_from_world.shape[:-2])
-    if not isinstance(dim, int) or isinstance(dim, bool) or not 0 <= dim < len(leading):
+    if not is_whole(dim) or not 0 <= dim < len(leading):
         raise ShapeError(f"select: dim must be a leading axis of {leading}; got {describe(dim)}")
-    if not isinstance(index, int) or isinstance(index, bool) or not -leading[dim] <= index < leading[dim]:
+    if not is_whole(index) or not -leading[dim] <= index < leading[dim]:
         raise ShapeError(f"select: index must be one of {leading[dim]} cameras; got {describe(index)}")
-    return CameraTensors(*(torch.as_tensor(field).select(dim, index) for field in tensors))
+    fields = (tensors.intrinsics, tensors.cam_from_world, *image_sizes(tensors))
+    return CameraTensors(*(field.select(dim, index) for field in fields))
 
 
 def to(

@@ -15,7 +15,7 @@ from typing import TypedDict
 import numpy as np
 from torch.utils.data import Dataset, Sampler
 
-from lsmgeo._checks import check_choice, check_flag, check_number, check_whole, describe
+from lsmgeo._checks import check_choice, check_flag, check_number, check_whole, describe, is_whole
 from lsmgeo.data.backgrounds import Background, BackgroundError, make_background
 from lsmgeo.data.sample import Sample
 from lsmgeo.data.shard_reading import ShardSet
@@ -130,8 +130,8 @@ class ShapeDataset(Dataset[Sample]):
         if len(pair) != 2:
             raise OptionError(f"ShapeDataset: an item is an index or (epoch, index); got {describe(item)}")
         epoch, index = pair
-        if not isinstance(index, (int, np.integer)) or isinstance(index, bool) or not 0 <= index < len(self):
-            if isinstance(index, (int, np.integer)):  # what tells Python's own iteration where to stop
+        if not is_whole(index) or not 0 <= index < len(self):
+            if is_whole(index):  # what tells Python's own iteration where to stop
                 raise IndexError(f"ShapeDataset: index must be from 0 to {len(self) - 1}; got {index}")
             raise OptionError(f"ShapeDataset: an item is an index or (epoch, index); got {describe(item)}")
         epoch, index = check_whole("ShapeDataset", "epoch", epoch, 0), int(index)
@@ -304,7 +304,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
 def _view_range(views: int | tuple[int, int] | None) -> tuple[int, int] | None:
     if views is None:
         return None
-    pair = [views, views] if isinstance(views, int) else list(views) if isinstance(views, (tuple, list)) else []
+    pair = [views, views] if is_whole(views) else list(views) if isinstance(views, (tuple, list)) else []
     if len(pair) != 2:
         raise OptionError(f"ShapeDataset: views must be a number, (low, high) or None; got {describe(views)}")
     low, high = (check_whole("ShapeDataset", "views", value, 1) for value in pair)

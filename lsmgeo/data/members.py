@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_number, describe
+from lsmgeo._checks import check_number, check_whole, describe
 from lsmgeo.cameras.tensors import check_cameras
 from lsmgeo.data.images import DEPTH, RGBA, decode_png, encode_png
 from lsmgeo.data.metadata import MAX_SIDE, MAX_VIEWS, MAX_VOXELS, is_text
@@ -138,8 +138,8 @@ def encode_sample(
         },
         "voxels": sorted(grids),
     }
-    if seed is not None and (not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63):
-        raise OptionError(f"encode_sample: seed must be an integer in [0, 2^63) or None; got {describe(seed)}")
+    if seed is not None:
+        seed = check_whole("encode_sample", "seed", seed, 0)
     members = {"json": json.dumps(metadata, separators=(",", ":"), allow_nan=False).encode()}
     for view in range(views):
         members[f"{view:02d}.png"] = encode_png(pictures[view])

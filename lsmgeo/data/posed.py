@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
-from lsmgeo._checks import describe
+from lsmgeo._checks import describe, is_whole
 from lsmgeo.data.images import read_cut_out, read_image
 from lsmgeo.data.sample import Sample
 from lsmgeo.errors import DataError, OptionError, ShapeError
@@ -171,8 +171,7 @@ class PosedImages:
             DataError: a file is missing, damaged, or not of its camera's size; or the voxels fill no cube.
         """
         chosen = list(range(len(self)) if views is None else views)
-        whole = all(isinstance(view, (int, np.integer)) and not isinstance(view, bool) for view in chosen)
-        if not chosen or not whole or not all(0 <= view < len(self) for view in chosen):
+        if not chosen or not all(is_whole(view) and 0 <= view < len(self) for view in chosen):
             raise OptionError(f"sample: views must be numbers from 0 to {len(self) - 1}; got {describe(views)}")
         # All sizes before the first photograph: they are large.
         sizes = {self.size(view): self.names[view] for view in chosen}

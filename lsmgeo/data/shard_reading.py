@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from lsmgeo._checks import check_flag, describe
+from lsmgeo._checks import check_flag, describe, is_whole
 from lsmgeo.data.backgrounds import Background, BackgroundError, make_background
 from lsmgeo.data.files import child
 from lsmgeo.data.members import decode_depth, decode_occupancy, decode_picture
@@ -98,7 +98,7 @@ class ShardSet:
 
     def _locate(self, index: int) -> tuple[int, int]:
         """The number of a shape's shard, and its row in that."""
-        if not isinstance(index, (int, np.integer)) or isinstance(index, bool) or not 0 <= index < len(self):
+        if not is_whole(index) or not 0 <= index < len(self):
             raise OptionError(f"ShardSet: index must be an integer from 0 to {len(self) - 1}; got {describe(index)}")
         number = bisect_right(self._ends, int(index))
         return number, int(index) - (self._ends[number - 1] if number else 0)

@@ -62,7 +62,26 @@ def select(operator: str, source: Tensor, options: Options, backend: str = "auto
 
 def run(operator: str, source: Tensor, *args: Any, options: Options, backend: str = "auto") -> Any:
     """Run an operator on the backend that `select` names."""
-    return select(operator, source, options, backend).operators[operator](source, *args, options)
+    backend_operator = select(operator, source, options, backend).operators[operator]
+    return backend_operator(source, *_differentiable(operator, args, options), options)
+
+
+def _differentiable(operator: str, args: tuple[Any, ...], options: Options) -> tuple[Any, ...]:
+    """The arguments, without the derivatives that no answer has: the nearest cell has none by the geometry."""
+    nearest, appended = options.mode == "nearest", options.depth or bool(options.direction)
+    if operator == "sample_views":
+        pixels, depth, valid = args
+        return pixels.detach() if nearest else pixels, depth if options.depth else depth.detach(), valid
+    if not nearest:
+        return args
+    if operator == "unproject_points":
+        matrix, direction, points, view_mask = args
+        matrix, points = matrix if options.depth else matrix.detach(), points if appended else points.detach()
+        return matrix, direction, points, view_mask
+    sites, *others = args
+    # The depth of an image's site comes from its matrix, that of a plane from the table of depths.
+    matrix = sites.matrix if options.depth and operator == "unproject" else sites.matrix.detach()
+    return sites._replace(matrix=matrix, z=sites.z if appended else sites.z.detach()), *others
 
 
 def explain(operator: str, source: Tensor, **options: Any) -> str:

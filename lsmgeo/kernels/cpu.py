@@ -143,7 +143,7 @@ def fresh(shape: Sequence[int], dtype: torch.dtype, order: Sequence[int] | None 
     Large outputs are put in huge pages: touching fresh pages of 4 KiB costs as much as the kernels do.
     """
     order = tuple(range(len(shape))) if order is None else order
-    tensor = torch.empty([shape[axis] for axis in order], dtype=dtype)
+    tensor = torch.empty([shape[axis] for axis in order], dtype=dtype, device="cpu")
     if tensor.nbytes >= HUGE and not isinstance(library := _library(), str):
         library.lsmgeo_use_huge_pages(tensor.data_ptr(), tensor.nbytes)
     return tensor.permute([order.index(axis) for axis in range(len(shape))])
@@ -243,7 +243,7 @@ def _geometry_gradients(call: _Call, needs: Sequence[bool]) -> list[Tensor | Non
     B, V, D = call.scenes, call.views, call.sites[2]
     shapes = ((3, 4), (3, 4), (D,))
     parts = [
-        torch.zeros(B, V, call.chunks, *shape, dtype=torch.float64) if need else None
+        torch.zeros(B, V, call.chunks, *shape, dtype=torch.float64, device="cpu") if need else None
         for shape, need in zip(shapes, needs, strict=True)
     ]
     call.matrix_gradient, call.direction_gradient, call.z_gradient = (
@@ -302,7 +302,7 @@ def images(source: Tensor, sites: Sites, options: Options, out: Tensor | None = 
     else:
         values = fresh((B, V, channels, *counts), source.dtype, (0, 1, 3, 4, 5, 2)) if out is None else out
         strides = values.stride()
-    visible = torch.empty((B, V, *counts), dtype=torch.bool)
+    visible = torch.empty((B, V, *counts), dtype=torch.bool, device="cpu")
     _values(call, values, strides, visible)
     _run(call, backward=False)
     del kept
@@ -348,7 +348,7 @@ def pixels(
     else:
         values = fresh((B, V, channels, N), source.dtype, (0, 1, 3, 2))
         strides = (*values.stride()[:3], 0, 0, values.stride(3))
-    visible = torch.empty((B, V, N), dtype=torch.bool)
+    visible = torch.empty((B, V, N), dtype=torch.bool, device="cpu")
     _values(call, values, strides, visible)
     _run(call, backward=False)
     del kept
@@ -385,11 +385,11 @@ def pixels_backward(
     else:
         _gradient(call, gradient, (*strides[:3], 0, 0, strides[3]))
     to_source = _source_gradient(call, source, 2, None) if needs[0] else None
-    to_pixels = torch.zeros((call.chunks, *pixels.shape), dtype=torch.float32) if needs[1] else None
+    to_pixels = torch.zeros((call.chunks, *pixels.shape), dtype=torch.float32, device="cpu") if needs[1] else None
     call.pixels_gradient = None if to_pixels is None else to_pixels.data_ptr()
     to_extra = None
     if needs[2] and extra is not None:
-        to_extra = torch.zeros((*front.shape, call.extra), dtype=torch.float32)
+        to_extra = torch.zeros((*front.shape, call.extra), dtype=torch.float32, device="cpu")
         call.extras_gradient = to_extra.data_ptr()
     _run(call, backward=True)
     del kept
@@ -407,7 +407,7 @@ def volume(source: Tensor, sites: Sites, options: Options, out: Tensor | None = 
     shape = (call.scenes, call.views, source.shape[1] + call.depth + 3 * call.direction, *counts)
     if out is None:
         out = fresh(shape, source.dtype, (0, 1, 4, 5, 2, 3) if options.stacked else (0, 1, 3, 4, 5, 2))
-    visible = torch.empty((*shape[:2], *counts), dtype=torch.bool)
+    visible = torch.empty((*shape[:2], *counts), dtype=torch.bool, device="cpu")
     _values(call, out, out.stride(), visible)
     _run(call, backward=False)
     del kept

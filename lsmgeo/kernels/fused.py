@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from lsmgeo._dtypes import saturating_cast
+from lsmgeo._dtypes import saturating_cast, saturation_limit
 from lsmgeo.kernels import cpu, gpu, reference
 from lsmgeo.kernels.points import pixels_in_front, project_points, sample_pixels
 from lsmgeo.kernels.request import Options, Sites
@@ -287,6 +287,12 @@ def _unstacked(tile: Tensor, planes: int, channels: int, width: int) -> Tensor:
     return tile.view(rows, width, planes, channels).permute(3, 2, 0, 1)[None, None]
 
 
+def _linear(weight: Tensor, bias: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Weights (P C', O) and bias (O,) in float32."""
+    offset = weight.new_zeros(weight.shape[0], dtype=torch.float32) if bias is None else bias.float()
+    return weight.permute(2, 1, 0).reshape(-1, weight.shape[0]).float(), offset
+
+
 def _project_reduce(kernels: Any, given: dict[str, Any], options: Options) -> tuple[Tensor, Tensor]:
     source, sites, weight, bias = _neighbours(given["source"]), _sites(given), given["weight"], given["bias"]
     maps, visible = _shapes("project_reduce", given)
@@ -294,8 +300,7 @@ def _project_reduce(kernels: Any, given: dict[str, Any], options: Options) -> tu
         maps = cpu.fresh(maps.shape, source.dtype, (0, 1, 3, 4, 2))
     outputs, channels, planes = weight.shape
     width = maps.shape[4]
-    kernel = weight.permute(2, 1, 0).reshape(planes * channels, outputs).float()
-    offset = weight.new_zeros(outputs, dtype=torch.float32) if bias is None else bias.float()
+    kernel, offset = _linear(weight, bias)
     memory = None
     options = replace(options, stacked=False)
     with torch.autocast(source.device.type, enabled=False):
@@ -323,12 +328,13 @@ def _project_reduce_backward(
     source = _neighbours(original)
     outputs, channels, planes = weight.shape
     (B, V), width, D = sites.matrix.shape[:2], sites.x.shape[0], sites.z.shape[-1]
-    kernel = weight.permute(2, 1, 0).reshape(planes * channels, outputs).float()
-    options = replace(options, stacked=False)
+    kernel, offset = _linear(weight, given["bias"])
+    options, saturates = replace(options, stacked=False), gradient.dtype != torch.float32
     places, needs_weight, needs_bias = needs[:4], needs[4], needs[5]
     to_source = _channels_last(source, source.shape, 1, torch.float32).zero_() if needs[0] else None
     parts = [sites.matrix.new_zeros(shape) for shape in ((B, V, 3, 4), (B, V, 3, 4), (B, V, D))]
     to_kernel = torch.zeros_like(kernel) if needs_weight else None
+    to_bias = torch.zeros_like(offset) if needs_bias else None
     memory = None
     with torch.autocast(source.device.type, enabled=False):
         for b, v, rows in _tiles(given, given["kernels"]):
@@ -336,13 +342,17 @@ def _project_reduce_backward(
             if memory is None:
                 memory = source.new_empty((pixels, planes * channels), dtype=torch.float32)
             tile = memory[:pixels]
-            volume, incoming = (
-                source[b : b + 1],
-                gradient[b, v, :, rows].permute(1, 2, 0).reshape(pixels, outputs).float(),
-            )
-            if to_kernel is not None:
+            volume = source[b : b + 1]
+            incoming = gradient[b, v, :, rows].permute(1, 2, 0).reshape(pixels, outputs).float()
+            if to_kernel is not None or saturates:
                 kernels.volume(volume, part, options, _unstacked(tile, planes, channels, width))
+            if saturates:
+                kept = torch.addmm(offset, tile, kernel).abs() <= saturation_limit(gradient.dtype)
+                incoming = torch.where(kept, incoming, 0.0)
+            if to_kernel is not None:
                 to_kernel.addmm_(tile.t(), incoming)
+            if to_bias is not None:
+                to_bias += incoming.sum(0)
             if any(places):
                 torch.mm(incoming, kernel.t(), out=tile)
                 swept = _unstacked(tile, planes, channels, width)
@@ -354,9 +364,7 @@ def _project_reduce_backward(
     to_weight = None
     if to_kernel is not None:
         to_weight = to_kernel.view(planes, channels, outputs).permute(2, 1, 0).contiguous().to(weight.dtype)
-    to_bias = None
-    if needs_bias:
-        to_bias = gradient.sum((0, 1, 3, 4), dtype=torch.float32).to(given["bias"].dtype)
+    to_bias = None if to_bias is None else to_bias.to(given["bias"].dtype)
     to_source = None if to_source is None else saturating_cast(to_source, original.dtype)
     return to_source, *parts, to_weight, to_bias
 

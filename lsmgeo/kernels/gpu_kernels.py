@@ -289,7 +289,7 @@ def _moments(PART: tl.constexpr, share, source, lattice, points, site, n, near, 
     WIDTH: tl.constexpr = HOW.channels if PART == FEATURES else HOW.width
     mean = tl.zeros([HOW.sites, WIDTH], tl.float32)
     best = tl.full([HOW.sites, WIDTH], float("-inf"), tl.float32)
-    first = tl.zeros([HOW.sites, WIDTH], tl.int32)
+    first = tl.full([HOW.sites, WIDTH], -1, tl.int32)
     top = tl.zeros([HOW.sites, WIDTH], tl.float32)
     for v in range(n.views):
         view = site.owner * n.views + v
@@ -298,11 +298,12 @@ def _moments(PART: tl.constexpr, share, source, lattice, points, site, n, near, 
         seen = place.visible[:, None]
         kept = tl.where(seen, values, 0.0)
         mean += kept * share[:, None]  # shares before the sum, which could overflow
-        better = seen & (values > best) | seen & (values != values) & (best == best)  # a NaN wins, and stays
+        # The first that is seen, then the larger; a NaN wins, and stays.
+        better = seen & ((first < 0) | (values > best) | (values != values) & (best == best))
         best = tl.where(better, values, best)
         first = tl.where(better, v, first)
         top = tl.maximum(top, tl.abs(kept))
-    return mean, tl.where(best == float("-inf"), 0.0, best), first, tl.max(tl.max(top, 1), 0)
+    return mean, tl.where(first < 0, 0.0, best), first, tl.max(tl.max(top, 1), 0)
 
 
 @triton.jit

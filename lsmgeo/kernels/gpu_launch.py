@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from lsmgeo._dtypes import saturation_limit
 from lsmgeo.kernels.gpu_tables import Tables
 from lsmgeo.kernels.request import Options
 
@@ -105,7 +106,7 @@ def plan(
         mean=order.get("mean", -1),
         variance=order.get("variance", -1),
         maximum=order.get("max", -1),
-        largest=torch.finfo(target.dtype).max,
+        largest=min(saturation_limit(target.dtype), torch.finfo(torch.float32).max),
         sites=block,
         planes=run,
         channels=columns,

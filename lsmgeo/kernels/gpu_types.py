@@ -128,7 +128,7 @@ class How(NamedTuple):
     mean: int  # place of its block of channels; -1 if not asked for
     variance: int
     maximum: int
-    largest: float  # finite value of the output's dtype
+    largest: float  # beyond it the output saturates, see `lsmgeo._dtypes.saturation_limit`
     sites: int  # of a tile
     planes: int  # of them that follow each other along the third axis: 1 unless that is the output's fastest
     channels: int  # of the features' tile

@@ -41,8 +41,8 @@ def pixels_in_front(
     pixels: Tensor, depth: Tensor, valid: Tensor, options: Options
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """The arguments of `reference.sample_views` as those of `sample_pixels`, in float32."""
-    distance = depth.float()
-    extra = torch.where(valid, distance, 0.0)[:, :, None] if options.depth else None
+    distance, largest = depth.float(), torch.finfo(torch.float32).max
+    extra = torch.where(valid, distance.clamp(-largest, largest), 0.0)[:, :, None] if options.depth else None
     return pixels.float(), valid & (distance > options.near), extra
 
 

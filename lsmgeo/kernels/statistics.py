@@ -7,7 +7,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["view_statistics"]
+__all__ = ["first_maximum", "view_statistics"]
+
+
+def first_maximum(values: Tensor, seen: Tensor, dim: int) -> Tensor:
+    """Index of the first seen value that is the largest, with `dim` of size 1; any where none is seen."""
+    largest, first = torch.where(seen, values.detach(), -torch.inf).max(dim, keepdim=True)
+    return torch.where(largest == -torch.inf, seen.to(torch.uint8).argmax(dim, keepdim=True), first)
 
 
 def view_statistics(values: Tensor, visible: Tensor, statistics: Sequence[str]) -> Tensor:
@@ -38,6 +44,5 @@ def view_statistics(values: Tensor, visible: Tensor, statistics: Sequence[str]) 
             blocks.append((deviation.square() * share[:, None]).sum(1).clamp(max=largest))
         else:
             # Indices of the first maximum, so that equal views do not share the gradient.
-            first = torch.where(seen, values.detach(), -torch.inf).max(1, keepdim=True).indices
-            blocks.append(kept.gather(1, first)[:, 0])
+            blocks.append(kept.gather(1, first_maximum(values, seen, 1))[:, 0])
     return torch.cat(blocks, 1)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lsmgeo._checks import is_whole
 from lsmgeo.errors import OptionError
 from lsmgeo.scenes.solids import Kind, Solid
 from lsmgeo.scenes.tables import Scene, check_scenes
@@ -44,7 +45,7 @@ def to_mesh(scene: Scene, *, segments: int = 64) -> trimesh.Trimesh:
     import trimesh
 
     (scene,) = check_scenes("to_mesh", [scene])
-    if isinstance(segments, bool) or not isinstance(segments, int) or segments < 8 or segments % 4:
+    if not is_whole(segments) or segments < 8 or segments % 4:
         raise OptionError(f"to_mesh: segments must be a multiple of 4, at least 8; got {segments!r}")
     if any(solid.kind is Kind.HALF_SPACE for solid in scene.solids):
         raise OptionError("to_mesh: a half-space has no closed surface; expected parts of finite size")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,6 +16,8 @@ from lsmgeo import (
     cameras,
     depth_planes,
     functional,
+    fusion,
+    rays,
 )
 from lsmgeo.errors import CameraError, DeviceError, DTypeError, GridError, LsmGeoError, OptionError, ShapeError
 from tests.fuzz.calls import sweep, unproject, with_scale, with_value
@@ -295,6 +298,44 @@ def test_the_message(mistake):
     call, kind, text = MISTAKES[mistake]
     with pytest.raises(kind, match=re.escape(text)):
         call()
+
+
+WHOLE = {
+    "VoxelGrid": lambda n: VoxelGrid(n),
+    "VoxelGrid, three": lambda n: VoxelGrid((n, n, n)),
+    "FrustumGrid": lambda n: FrustumGrid(cameras.select(right_cameras(B, V), 1, 0), DEPTHS, (n, n)),
+    "depth_planes": lambda n: depth_planes(1.0, 2.0, n),
+    "PlaneSweepProject": lambda n: PlaneSweepProject(GRID, DEPTHS, (n, n)),
+    "ProjectReduce": lambda n: rays.ProjectReduce(n, n, GRID, DEPTHS, (n, n)),
+    "unproject_slabs": lambda n: list(functional.unproject_slabs(FEATURES, VIEWS, GRID, n)),
+    "ConvGRU3d": lambda n: fusion.ConvGRU3d(n, n, kernel_size=n),
+    "ConvLSTM3d": lambda n: fusion.ConvLSTM3d(n, n, kernel_size=n),
+    "orbit": lambda n: cameras.orbit(0.0, 0.0, 2.0, focal_length=9.0, height=n, width=n),
+    "resize": lambda n: cameras.resize(VIEWS, n, n),
+    "crop": lambda n: cameras.crop(VIEWS, 0, 0, n, n),
+    "rays": lambda n: cameras.rays(VIEWS, (n, n)),
+    "select": lambda n: cameras.select(VIEWS, n, n),
+    "stack": lambda n: cameras.stack([VIEWS, VIEWS], n),
+    "from_opencv": lambda n: cameras.from_opencv(torch.eye(3), torch.eye(3), torch.zeros(3), n, n),
+    "from_pytorch3d": lambda n: cameras.from_pytorch3d(
+        torch.eye(3), torch.zeros(3), torch.ones(2), torch.zeros(2), n, n
+    ),
+    "CameraTensors": lambda n: cameras.as_tensors(cameras.CameraTensors(torch.eye(3), torch.eye(4), n, n)),
+}
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_whole_numbers_are_pythons_and_numpys(name):
+    for kind in (int, np.int32, np.int64, np.uint8):
+        WHOLE[name](kind(1))
+    for value in (1.0, np.float32(1.0), True, np.True_, "1", None):
+        if value is not None or name not in ("PlaneSweepProject",):
+            with pytest.raises(LsmGeoError):
+                WHOLE[name](value)
+
+
+def test_sizes_are_kept_as_pythons_numbers():
+    assert [type(n) for n in VoxelGrid((np.int64(1), 2, np.uint8(3))).shape] == [int, int, int]
 
 
 def test_a_rotation_off_by_less_than_the_tolerance_is_taken():

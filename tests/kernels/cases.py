@@ -112,3 +112,48 @@ HALF: dict[str, Callable[[str], None]] = {
         "small numbers": _case(unproject_call, (1e-5 * WIDE).to(dtype), VIEWS, GRID, padding_mode="border"),
     }.items()
 }
+
+
+# In a world of another unit variances, depths and sums go beyond what float16 holds, beside others that do not.
+UNIT = 5e4
+FAR_VIEWS = VIEWS._replace(
+    cam_from_world=torch.cat((VIEWS.cam_from_world[..., :3], UNIT * VIEWS.cam_from_world[..., 3:]), -1)
+)
+FAR_VIEWS.cam_from_world[..., 3, 3] = 1.0
+FAR_GRID = VoxelGrid(GRID.shape, GRID.lower, GRID.upper, torch.diag(torch.tensor([UNIT, UNIT, UNIT, 1.0])) @ POSE)
+LARGE = (1020.0 * torch.rand(WIDE.shape, generator=_generator)).half()
+HALF |= {
+    "variance that saturates": _case(unproject_call, LARGE, VIEWS, GRID, reduce="variance"),
+    "statistics that saturate": _case(unproject_call, LARGE, FAR_VIEWS, FAR_GRID, reduce=_EVERY, **_both()),
+    "depth that saturates": _case(unproject_call, FEATURES.half(), FAR_VIEWS, FAR_GRID, **_both()),
+    "swept depth that saturates": _case(
+        sweep_call, VOLUME.half(), FAR_VIEWS, FAR_GRID, UNIT * DEPTHS, SIZE, flatten=False, **_both()
+    ),
+    "given depth that saturates": _case(views_call, FEATURES.half(), PIXELS, 1e5 * DISTANCE, VALID, augment="depth"),
+    "points' statistics that saturate": _case(points_call, LARGE, VIEWS, POINTS, reduce=_EVERY),
+    "reduced sweep that saturates": _case(
+        reduce_call, 1e3 * VOLUME.half(), *SWEEP[1:], 100.0 * WEIGHT, 2e4 * BIAS, padding_mode="border"
+    ),
+}
+
+# What no gradient to the geometry comes from, but through the channels that are named.
+NEAREST = {
+    f"{operator}, {augment or 'nothing'}, {reduce}": make(
+        *given,
+        mode="nearest",
+        **({"augment": augment} if augment else {}),
+        **({"reduce": reduce} if reduce else {}),
+    )
+    for operator, make, given in (
+        ("unproject", unproject_call, (FEATURES, VIEWS, GRID)),
+        ("points", points_call, (FEATURES, VIEWS, POINTS)),
+        ("pixels", views_call, (FEATURES, PIXELS, DISTANCE, VALID)),
+        ("sweep", sweep_call, SWEEP),
+        ("reduced sweep", reduce_call, (*SWEEP, WEIGHT, None)),
+    )
+    for augment in ("", "depth", "direction")
+    for reduce in (None, "mean")
+    if not (reduce and "sweep" in operator)
+    and not (augment == "direction" and operator == "pixels")
+    and not (augment and operator == "reduced sweep")
+}

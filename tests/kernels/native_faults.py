@@ -71,6 +71,18 @@ FAULTS = {
         "const S *source = source_of<S>(call, scene, view) + $channel$;",
         "0",
     ),
+    "depths that saturate differentiated": (
+        "geometric.by_distance[s] = $distance < LARGEST && distance <= limit ? *gradient : 0.0f$;",
+        "*gradient",
+    ),
+    "given channels that saturate differentiated": (
+        "call.extras_gradient[at] = $std::fabs(call.extras[at]) <= limit ? *gradient : 0.0f$;",
+        "*gradient",
+    ),
+    "statistics that saturate differentiated": (
+        "gradient = $held_lanes<W>(result, limit) == result ? gradient : Floats<W>{}$;",
+        "gradient",
+    ),
     "gradient not cleared": ("if ($!call.source_gradient || call.accumulate$) return;", "true"),
     "bfloat16 cut off": ("$(bits + 0x7fff + (bits >> 16 & 1)) >> 16$;", "bits >> 16"),
     "float16 denormals lost": ("magnitude < (113u << 23) ? $small$ : normal", "0u"),

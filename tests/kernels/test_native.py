@@ -316,6 +316,37 @@ def test_no_sites_no_gradient():
     torch.testing.assert_close(gradient, torch.zeros_like(features), rtol=0, atol=0)
 
 
+def test_gradients_of_held_deviations_are_the_references():
+    """Where the square of one view's deviation overflows, the mean's share of the others' does not cancel."""
+    features = 1e18 * cases.FEATURES + torch.tensor([4e19, 0.0, 0.0])[:, None, None, None]
+    found = []
+    for backend in ("cpu", "reference"):
+        leaf = features.clone().requires_grad_()
+        volume, _ = functional.unproject(
+            leaf, cases.VIEWS, cases.GRID, reduce=("mean", "variance"), padding_mode="border", backend=backend
+        )
+        found += torch.autograd.grad(volume, leaf, torch.full_like(volume, 1e-20))
+    largest = float(found[1].abs().max())
+    assert 0.0 < largest < torch.inf
+    torch.testing.assert_close(*found, rtol=1e-3, atol=1e-4 * largest)
+
+
+@pytest.mark.parametrize("name", cases.NEAREST)
+def test_the_nearest_cell_depends_on_no_geometry_on_any_backend(name):
+    """A gradient is offered where the answer depends on an argument, and nowhere else."""
+    call = cases.NEAREST[name]
+    offered = []
+    for backend in ("cpu", "reference"):
+        offered.append([])
+        for chosen in range(len(call.leaves)):
+            leaves = [leaf.detach().requires_grad_(number == chosen) for number, leaf in enumerate(call.leaves)]
+            offered[-1].append(call.run(*leaves, backend=backend)[0].requires_grad)
+    assert offered[0] == offered[1]
+    assert offered[0][0]
+    if "depth" not in name and "direction" not in name:
+        assert offered[0] == [True, *(leaf.shape == cases.WEIGHT.shape for leaf in call.leaves[1:])]
+
+
 def test_gradients_of_far_planes_are_finite():
     depths = torch.tensor([1.0, 2.0, 1e20, 1e25, 3e30])
     found = []

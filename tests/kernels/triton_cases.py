@@ -176,6 +176,19 @@ def half_precision_saturates() -> None:
 
 
 @case
+def the_largest_of_minus_infinity() -> None:
+    """An unseen view does not stand for it, and what no view sees stays 0."""
+    source, sites = torch.full_like(features(2), -torch.inf), image_sites(7, mask=True)
+    options = Options("nearest", reduce=("max",))
+    found, visible = gpu.images(source, sites, options)
+    expected = torch.where(visible.any(1), -torch.inf, 0.0)[:, None].expand_as(found)
+    assert bool(visible.any(1).any())
+    assert not bool(visible.any(1).all())
+    torch.testing.assert_close(found, expected, rtol=0, atol=0)
+    torch.testing.assert_close(reference.unproject(source, sites, options)[0], expected, rtol=0, atol=0)
+
+
+@case
 def large_numbers_stay_finite() -> None:
     source = 3e38 * features(2).sign()
     sites, options = image_sites(), Options("bilinear", "border", reduce=EVERY)

@@ -8,10 +8,11 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from lsmgeo import FrustumGrid, PlaneSweepProject, VoxelGrid, depth_planes, functional, rays
+from lsmgeo import FrustumGrid, PlaneSweepProject, VoxelGrid, depth_planes, functional, kernels, rays
 from lsmgeo.cameras import CameraTensors, crop, from_opencv, orbit, select, to
 from lsmgeo.cameras import rays as camera_rays
 from lsmgeo.errors import CameraError, DeviceError, DTypeError, ShapeError
+from lsmgeo.kernels import Options
 
 VIEWS = orbit(torch.tensor([[0.0, 40.0]]), 10.0, 2.0, focal_length=50.0, height=24, width=32)
 FEATURES = torch.rand(1, 2, 3, 12, 16, generator=torch.Generator().manual_seed(0))
@@ -102,6 +103,35 @@ def test_hidden_samples_of_a_ray_are_unread():
     depth.sum().backward()
     torch.testing.assert_close(depth.detach(), torch.zeros(1, 1), rtol=0, atol=0)
     torch.testing.assert_close(scores.grad, torch.zeros(2, 1, 1), rtol=0, atol=0)
+
+
+def test_a_hidden_sample_does_not_stand_for_minus_infinity():
+    values = torch.tensor([5.0, -torch.inf, -torch.inf]).reshape(3, 1, 1).requires_grad_()
+    visible = torch.tensor([False, True, True]).reshape(3, 1, 1)
+    largest = rays.max_along_rays(values, visible)
+    assert largest.item() == -torch.inf
+    (gradient,) = torch.autograd.grad(largest.sum(), values)
+    assert gradient.flatten().tolist() == [0.0, 1.0, 0.0]
+    statistic = functional.view_statistics(values[None], visible[None, :, 0], "max")
+    assert statistic.item() == -torch.inf
+    nothing = rays.max_along_rays(values, torch.zeros_like(visible))
+    assert nothing.item() == 0.0
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_a_given_depth_beyond_float32_stays_finite(backend):
+    features, pixels = FEATURES[:1, :1], torch.zeros(1, 1, 2, 2, dtype=torch.float64)
+    depth = torch.tensor([[[1e300, 2.0]]], dtype=torch.float64, requires_grad=True)
+    if backend not in {
+        taken.name for taken in kernels.BACKENDS if not taken.why_not("sample_views", features, Options("bilinear"))
+    }:
+        pytest.skip("no C++ kernels")
+    volume, _ = functional.sample_views(
+        features, pixels, depth, torch.ones(1, 1, 2, dtype=torch.bool), augment="depth", backend=backend
+    )
+    assert volume[0, 0, -1].tolist() == [torch.finfo(torch.float32).max, 2.0]
+    (gradient,) = torch.autograd.grad(volume.sum(), depth)
+    assert gradient.flatten().tolist() == [0.0, 1.0]
 
 
 def test_nearest_holds_the_number_just_below_a_half():

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from lsmgeo import PlaneSweepProject, Unproject, VoxelGrid, depth_planes, functional, rays
 from lsmgeo.cameras import crop, look_at, orbit, perturb
 from lsmgeo.cameras import rays as camera_rays
+from lsmgeo.errors import GridError
 from tests import oracle, tolerances
 from tests.property import support
 from tests.strategies import scenes, vectors
@@ -44,6 +45,28 @@ def test_depth_planes_are_evenly_spaced_in_their_measure(count, near, ratio):
         np.testing.assert_allclose(steps, np.full(count - 1, (measure(far) - measure(near)) / (count - 1)), rtol=1e-6)
         both = depth_planes(torch.tensor([near, 2 * near]), torch.tensor([far, 3 * far]), count, spacing=spacing)
         assert both.shape == (2, count)
+
+
+@pytest.mark.parametrize("spacing", ["depth", "inverse", "log"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_depth_planes_are_strictly_ascending_as_long_as_there_are_numbers(spacing, dtype):
+    step = torch.finfo(dtype).eps
+    for near, far, count in (
+        (1.0, 1.0 + 8 * step, 9),
+        (1.0 - 5 * step, 1.0 + 5 * step, 16),
+        (1e3, 1e3 + 1e6 * step, 9),
+    ):
+        ends = torch.tensor(near, dtype=dtype, requires_grad=True), torch.tensor(far, dtype=dtype)
+        planes = depth_planes(*ends, count, spacing)
+        assert planes.dtype == dtype
+        assert bool((planes.diff() > 0).all()), (near, far, planes)
+        torch.testing.assert_close(planes[[0, -1]], torch.stack(ends), rtol=0, atol=0)
+        assert bool(torch.autograd.grad(planes.sum(), ends[0])[0] > 0)
+    far = torch.tensor([2.0, 1.0 + 8 * step], dtype=dtype)
+    rows = depth_planes(torch.ones(2, dtype=dtype), far, 9, spacing)
+    assert bool((rows.diff(dim=-1) > 0).all())
+    with pytest.raises(GridError, match="10 different numbers"):
+        depth_planes(torch.ones(2, dtype=dtype), far, 10, spacing)
 
 
 def test_depth_planes_are_differentiable():

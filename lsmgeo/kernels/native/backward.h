@@ -29,8 +29,7 @@ inline void collect(const Plan &plan, const Tile &tile, const float (*by_index)[
                 rows[2][s] = -(rows[0][s] * tile.index[0][s] + rows[1][s] * tile.index[1][s]);
         if (call.depth && !view.masked)
             for (int s = 0; s < n; s++) {
-                const bool free = tile.distance[s] < LARGEST && tile.distance[s] > -LARGEST;
-                const double by_height = free ? by_distance[s] / unit : 0.0;
+                const double by_height = by_distance[s] / unit;
                 rows[2][s] += float(by_height);
                 if (call.projective) extra_z -= by_height * double(tile.distance[s]) * view.scale;
             }
@@ -103,18 +102,24 @@ inline void collect(const Plan &plan, const Tile &tile, const float (*by_index)[
     }
 }
 
-// The parts of the incoming gradient that belong to geometric channels, site by site.
+// The parts of the incoming gradient that belong to geometric channels, site by site: 0 where they saturate.
 struct Geometric {
     float by_index[3][TILE], by_distance[TILE], by_direction[3][TILE];
 };
 
 inline void split(const Call &call, const Tile &tile, int s, const float *gradient, Geometric &geometric) {
-    if (call.depth) geometric.by_distance[s] = *gradient++;
+    const float limit = call.statistics ? LARGEST : saturation_limit(call.gradient_type);
+    if (call.depth) {
+        const float distance = std::fabs(tile.distance[s]);
+        geometric.by_distance[s] = distance < LARGEST && distance <= limit ? *gradient : 0.0f;
+        gradient++;
+    }
     if (call.direction)
         for (int row = 0; row < 3; row++) geometric.by_direction[row][s] = *gradient++;
     if (call.extra && call.extras_gradient) {
         const int64_t site = (tile.scene * call.views + tile.view) * call.sites[0] + tile.i + s;
-        std::memcpy(call.extras_gradient + site * call.extra, gradient, size_t(call.extra) * sizeof(float));
+        for (int64_t at = site * call.extra; at < (site + 1) * call.extra; at++, gradient++)
+            call.extras_gradient[at] = std::fabs(call.extras[at]) <= limit ? *gradient : 0.0f;
     }
 }
 
@@ -187,28 +192,39 @@ void sample_backward(const Plan &plan, int64_t scene, int64_t view, int64_t chun
 inline void unsummarise(const Call &call, const float *values, int64_t count, int64_t channels,
                         const float *const *gradients, float *out) {
     if (count == 0) return;
-    const float share = 1.0f / float(count);
+    const float share = 1.0f / float(count), limit = saturation_limit(call.gradient_type);
     over_channels(channels, [&](auto width, int64_t c) INLINED {
         constexpr int W = decltype(width)::value;
         const float *first = values + c;
         for (int64_t block = 0; block < call.statistics; block++) {
-            const Floats<W> gradient = read<W>(gradients[block] + c);
+            Floats<W> gradient = read<W>(gradients[block] + c), mean = {}, best, total = {};
             const int64_t kind = call.statistic[block];
-            Floats<W> mean = {}, best;
-            Masks<W> taker = {};
-            if (kind == VARIANCE) mean = mean_of<W>(first, count, channels);
+            Masks<W> taker = {}, held = {};
             if (kind == MAX) taker = best_of<W>(first, count, channels, best);
+            if (kind == VARIANCE || (kind == MEAN && limit < LARGEST)) mean = mean_of<W>(first, count, channels);
+            if (limit < LARGEST) {
+                const Floats<W> result =
+                    kind == MAX ? best : kind == MEAN ? mean : variance_of<W>(first, count, channels, mean);
+                gradient = held_lanes<W>(result, limit) == result ? gradient : Floats<W>{};
+            }
             for (int64_t v = 0; v < count; v++) {
                 Floats<W> part = gradient * share;
                 if (kind == VARIANCE) {
                     const Floats<W> apart = read<W>(first + v * channels) - mean;
-                    part = held_lanes<W>(apart, LARGEST_ROOT) == apart ? 2.0f * part * apart : Floats<W>{};
+                    const Masks<W> is_held = held_lanes<W>(apart, LARGEST_ROOT) != apart;
+                    part = is_held ? Floats<W>{} : 2.0f * part * apart;
+                    total += part;
+                    held |= is_held;
                 } else if (kind == MAX) {
                     part = taker == int32_t(v) ? gradient : Floats<W>{};
                 }
                 float *to = out + v * channels + c;
                 write<W>(to, block == 0 ? part : part + read<W>(to));
             }
+            if (!is_any<W>(held)) continue;
+            // Through the mean: 0 but for rounding, unless deviations are held.
+            const Floats<W> drift = held ? total * share : Floats<W>{};
+            for (int64_t v = 0; v < count; v++) write<W>(out + v * channels + c, read<W>(out + v * channels + c) - drift);
         }
     });
 }

@@ -230,6 +230,22 @@ template <int W> INLINE Floats<W> mean_of(const float *values, int64_t count, in
     return mean;
 }
 
+template <int W> INLINE Floats<W> variance_of(const float *values, int64_t count, int64_t step, Floats<W> mean) {
+    const float share = 1.0f / float(count);
+    Floats<W> result = {};
+    for (int64_t v = 0; v < count; v++) {
+        const Floats<W> apart = held_lanes<W>(read<W>(values + v * step) - mean, LARGEST_ROOT);
+        result += apart * apart * share;
+    }
+    return held_lanes<W>(result, LARGEST);
+}
+
+template <int W> INLINE bool is_any(Masks<W> lanes) {
+    int32_t any = 0;
+    for (int lane = 0; lane < W; lane++) any |= lanes[lane];
+    return any != 0;
+}
+
 // The first of the views that has the largest value, a NaN above all, and that value.
 template <int W> INLINE Masks<W> best_of(const float *values, int64_t count, int64_t step, Floats<W> &best) {
     best = read<W>(values);
@@ -249,7 +265,6 @@ inline void summarise(const Call &call, const float *values, int64_t count, int6
         std::memset(out, 0, size_t(call.statistics * channels) * sizeof(float));
         return;
     }
-    const float share = 1.0f / float(count);
     over_channels(channels, [&](auto width, int64_t c) INLINED {
         constexpr int W = decltype(width)::value;
         const float *first = values + c;
@@ -259,15 +274,7 @@ inline void summarise(const Call &call, const float *values, int64_t count, int6
                 best_of<W>(first, count, channels, result);
             } else {
                 result = mean_of<W>(first, count, channels);
-                if (call.statistic[block] == VARIANCE) {
-                    const Floats<W> mean = result;
-                    result = Floats<W>{};
-                    for (int64_t v = 0; v < count; v++) {
-                        const Floats<W> apart = held_lanes<W>(read<W>(first + v * channels) - mean, LARGEST_ROOT);
-                        result += apart * apart * share;
-                    }
-                    result = held_lanes<W>(result, LARGEST);
-                }
+                if (call.statistic[block] == VARIANCE) result = variance_of<W>(first, count, channels, result);
             }
             write<W>(out + block * channels + c, result);
         }

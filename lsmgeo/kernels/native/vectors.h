@@ -27,6 +27,11 @@ inline float held(float value, float largest) {
     return value > largest ? largest : value < -largest ? -largest : value;
 }
 
+// Above this an output saturates and nothing comes back through it, as in `lsmgeo._dtypes.saturation_limit`.
+inline float saturation_limit(int64_t type) {
+    return type == FLOAT32 ? LARGEST : type == BFLOAT16 ? 0x1.fe7f8p127f : 0x1.ffcffep15f;
+}
+
 // What is finite stays finite: the largest number of the type stands for all above it.
 inline void store(float *place, float value) { *place = value; }
 inline void store(Bfloat16 *place, float value) {

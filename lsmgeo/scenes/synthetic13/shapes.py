@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from lsmgeo._checks import check_size
+from lsmgeo._checks import check_size, check_whole
 from lsmgeo.cameras import CameraTensors, orbit
 from lsmgeo.errors import OptionError
 from lsmgeo.scenes.lighting import Lights
@@ -216,8 +216,7 @@ def random_lights(generator: np.random.Generator) -> Lights:
 
 def _sequence(who: str, seed: int, index: int, salt: int) -> np.random.SeedSequence:
     for name, value in (("seed", seed), ("index", index)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value < 2**32:
-            raise OptionError(f"{who}: {name} must be an integer from 0 to 2**32 - 1; got {value!r}")
+        check_whole(who, name, value, 0, 2**32 - 1)
     return np.random.SeedSequence([int(seed), int(index), salt])
 
 

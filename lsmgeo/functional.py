@@ -118,16 +118,7 @@ def unproject(
         tensor([2.3889, 2.6429])
     """
     who = "Unproject"
-    options = Options.checked(
-        who,
-        volume=False,
-        mode=mode,
-        padding_mode=padding_mode,
-        augment=augment,
-        direction_frame=direction_frame,
-        reduce=reduce,
-        near=near,
-    )
+    options = Options.checked(who, "bilinear", mode, padding_mode, augment, direction_frame, reduce, near)
     kernels.check_backend(who, backend)
     sites = image_sites(who, features, cameras, grid, view_mask, options)
     return Unprojected(*kernels.run("unproject", features, sites, options=options, backend=backend))
@@ -181,16 +172,7 @@ def unproject_slabs(
     """
     who = "unproject_slabs"
     check_whole(who, "planes", planes, 1)
-    options = Options.checked(
-        who,
-        volume=False,
-        mode=mode,
-        padding_mode=padding_mode,
-        augment=augment,
-        direction_frame=direction_frame,
-        reduce=reduce,
-        near=near,
-    )
+    options = Options.checked(who, "bilinear", mode, padding_mode, augment, direction_frame, reduce, near)
     kernels.check_backend(who, backend)
     sites = image_sites(who, features, cameras, grid, view_mask, options)
 
@@ -248,16 +230,7 @@ def unproject_points(
         tensor([[[[2.]]]])
     """
     who = "unproject_points"
-    options = Options.checked(
-        who,
-        volume=False,
-        mode=mode,
-        padding_mode=padding_mode,
-        augment=augment,
-        direction_frame=direction_frame,
-        reduce=reduce,
-        near=near,
-    )
+    options = Options.checked(who, "bilinear", mode, padding_mode, augment, direction_frame, reduce, near)
     kernels.check_backend(who, backend)
     matrices = image_matrices(who, features, cameras, view_mask)
     check_geometry(who, "points", points, "(B, N, 3)", rank=3)
@@ -317,9 +290,7 @@ def sample_views(
         tensor([[[[1.2500, 3.5000]]]])
     """
     who = "sample_views"
-    options = Options.checked(
-        who, volume=False, mode=mode, padding_mode=padding_mode, augment=augment, reduce=reduce, near=near
-    )
+    options = Options.checked(who, "bilinear", mode, padding_mode, augment, reduce=reduce, near=near)
     if options.direction:
         raise OptionError(f"{who}: augment must be 'depth' or nothing, a direction needs a camera; got {augment!r}")
     kernels.check_backend(who, backend)
@@ -399,15 +370,7 @@ def plane_sweep_project(
         tensor([ 0.2500,  0.0000, -0.2500])
     """
     who = "PlaneSweepProject"
-    options = Options.checked(
-        who,
-        volume=True,
-        mode=mode,
-        padding_mode=padding_mode,
-        augment=augment,
-        direction_frame=direction_frame,
-        near=near,
-    )
+    options = Options.checked(who, "trilinear", mode, padding_mode, augment, direction_frame, near=near)
     kernels.check_backend(who, backend)
     check_flag(who, "flatten", flatten)
     sites = sweep_sites(who, volume, cameras, grid, depths, size, view_mask, options)

@@ -62,16 +62,7 @@ class Unproject(nn.Module):
         if grid is not None and not isinstance(grid, (VoxelGrid, FrustumGrid)):
             raise DTypeError(f"Unproject: grid must be a VoxelGrid or a FrustumGrid; got {describe(grid)}")
         kernels.check_backend("Unproject", backend)
-        Options.checked(
-            "Unproject",
-            volume=False,
-            mode=mode,
-            padding_mode=padding_mode,
-            augment=augment,
-            direction_frame=direction_frame,
-            reduce=reduce,
-            near=near,
-        )
+        Options.checked("Unproject", "bilinear", mode, padding_mode, augment, direction_frame, reduce, near)
         self.grid = grid
         self.mode = mode
         self.padding_mode = padding_mode
@@ -169,15 +160,7 @@ class PlaneSweepProject(nn.Module):
             check_size(who, "size", size, 2, "(h, w)")
         check_flag(who, "flatten", flatten)
         kernels.check_backend(who, backend)
-        Options.checked(
-            who,
-            volume=True,
-            mode=mode,
-            padding_mode=padding_mode,
-            augment=augment,
-            direction_frame=direction_frame,
-            near=near,
-        )
+        Options.checked(who, "trilinear", mode, padding_mode, augment, direction_frame, near=near)
         self.grid = grid
         self.depths = depths
         self.size = size

@@ -253,15 +253,7 @@ def project_reduce(
         tensor([3., 3.])
     """
     who = "project_reduce"
-    options = Options.checked(
-        who,
-        volume=True,
-        mode=mode,
-        padding_mode=padding_mode,
-        augment=augment,
-        direction_frame=direction_frame,
-        near=near,
-    )
+    options = Options.checked(who, "trilinear", mode, padding_mode, augment, direction_frame, near=near)
     kernels.check_backend(who, backend)
     sites = sweep_sites(who, volume, cameras, grid, depths, size, view_mask, options)
     check_float(who, "weight", weight, "(O, C' P)")
@@ -336,15 +328,7 @@ class ProjectReduce(nn.Module):
     ) -> None:
         super().__init__()
         who = "ProjectReduce"
-        options = Options.checked(
-            who,
-            volume=True,
-            mode=mode,
-            padding_mode=padding_mode,
-            augment=augment,
-            direction_frame=direction_frame,
-            near=near,
-        )
+        options = Options.checked(who, "trilinear", mode, padding_mode, augment, direction_frame, near=near)
         kernels.check_backend(who, backend)
         for name, value in (("in_channels", in_channels), ("out_channels", out_channels)):
             check_whole(who, name, value, 1)

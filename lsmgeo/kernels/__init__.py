@@ -109,7 +109,8 @@ def explain(operator: str, source: Tensor, **options: Any) -> str:
     """
     check_choice("explain", "operator", operator, OPERATORS)
     check_float("explain", "source", source, "(B, V, C, h, w) or (B, C, D, H, W)", rank=5)
-    call = Options.checked("explain", volume=operator in ("plane_sweep_project", "project_reduce"), **options)
+    smooth = "trilinear" if operator in ("plane_sweep_project", "project_reduce") else "bilinear"
+    call = Options.checked("explain", smooth, **options)
     lines = [f"{operator} of {tuple(source.shape)} {str(source.dtype).removeprefix('torch.')} on {source.device.type}"]
     taken = False
     for backend in BACKENDS:

@@ -62,8 +62,7 @@ class Options:
     def checked(
         cls,
         who: str,
-        *,
-        volume: bool,
+        smooth: str,
         mode: Any = None,
         padding_mode: Any = "zeros",
         augment: Any = (),
@@ -71,8 +70,7 @@ class Options:
         reduce: Any = None,
         near: Any = 1e-6,
     ) -> Options:
-        """Options from a user's arguments; an `OptionError` names the one that is wrong."""
-        smooth = "trilinear" if volume else "bilinear"
+        """Options from a user's arguments (`smooth` or "nearest" is the mode); an `OptionError` names a wrong one."""
         mode = check_choice(who, "mode", smooth if mode is None else mode, (smooth, "nearest"))
         check_choice(who, "padding_mode", padding_mode, PADDING_MODES)
         extra = check_choices(who, "augment", augment, ("depth", "direction"))

@@ -36,7 +36,7 @@ CALLS = {
     ),
 }
 SOURCES = {"plane_sweep_project": VOLUME, "project_reduce": VOLUME}
-OPTIONS = Options.checked("test", volume=False)
+OPTIONS = Options.checked("test", "bilinear")
 
 
 def fake(reason: str | None, calls: list[str], name: str = "fake") -> Backend:

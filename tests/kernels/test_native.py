@@ -181,7 +181,7 @@ def test_the_same_bits_from_run_to_run(operator, threads):
 
 
 def test_memory_that_is_given_is_written_to():
-    options = Options.checked("test", volume=False)
+    options = Options.checked("test", "bilinear")
     sites = image_sites("test", cases.WIDE, cases.VIEWS, cases.GRID, None, options)
     expected, _ = cpu.images(cases.WIDE, sites, options)
     out = torch.full(expected.shape, torch.nan)  # contiguous, unlike what the kernel would make
@@ -196,7 +196,7 @@ def test_memory_that_is_given_is_written_to():
 
 
 def test_half_volumes_swept_into_float32():
-    options = Options.checked("test", volume=True)
+    options = Options.checked("test", "trilinear")
     volume = cases.VOLUME.bfloat16()
     sites = sweep_sites("test", volume, cases.VIEWS, cases.GRID, cases.DEPTHS, cases.SIZE, None, options)
     expected, _ = cpu.volume(volume.float(), sites, options)
@@ -212,7 +212,9 @@ def test_half_volumes_swept_into_float32():
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 @pytest.mark.parametrize("operator", ["images", "pixels", "volume", "project_reduce"])
 def test_opcheck(operator):
-    options = Options.checked("test", volume=operator in ("volume", "project_reduce"), augment="depth")
+    options = Options.checked(
+        "test", "trilinear" if operator in ("volume", "project_reduce") else "bilinear", augment="depth"
+    )
     flat = fused._flat(options)
     leaf = (cases.FEATURES if operator in ("images", "pixels") else cases.VOLUME).clone().requires_grad_()
     if operator == "pixels":

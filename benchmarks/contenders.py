@@ -82,7 +82,7 @@ def kernel(scene: Scene) -> dict[str, Callable[[], Any]]:
     if problem.device != "cpu" or problem.operator == "reduce" or problem.statistic == "dot":
         raise LeftOut("not one call of a kernel")
     reduce, is_sweep = problem.statistic or None, problem.is_sweep
-    options = Options.checked("benchmark", volume=is_sweep, mode=mode_of(scene), reduce=reduce)
+    options = Options.checked("benchmark", "trilinear" if is_sweep else "bilinear", mode_of(scene), reduce=reduce)
     options = replace(options, stacked=problem.flatten)
     if reason := cpu.why_not("plane_sweep_project" if is_sweep else "unproject", source, options):
         raise LeftOut(reason)

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from lsmgeo._checks import check_flag, describe
+from lsmgeo._checks import check_flag, check_whole
 from lsmgeo.data.files import child, read_bytes, read_text
 from lsmgeo.data.isolated import isolated
 from lsmgeo.data.meshes.mesh import DEFAULT_COLOUR, Mesh
 from lsmgeo.data.meshes.mesh_parsing import KINDS, parse_mesh
-from lsmgeo.errors import DataError, LsmGeoError, OptionError
+from lsmgeo.errors import DataError, LsmGeoError
 
 __all__ = ["load_mesh"]
 
@@ -79,8 +79,7 @@ def load_mesh(
     who = "load_mesh"
     check_flag(who, "guarded", guarded)
     for name, value in (("max_bytes", max_bytes), ("max_faces", max_faces)):
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise OptionError(f"{who}: {name} must be a whole number, 1 at least; got {describe(value)}")
+        check_whole(who, name, value, 1)
     path = Path(path)
     kind = path.suffix[1:].lower()
     if kind not in KINDS:

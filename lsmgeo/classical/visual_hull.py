@@ -189,7 +189,7 @@ def hull_box(
     leading = tuple(tensors.intrinsics.shape[:-2])
     if len(leading) != 1:
         raise ShapeError(f"{who}: cameras must have the leading shape (V,); got {leading}")
-    if not isinstance(masks, Tensor | Sequence) or isinstance(masks, str):
+    if not isinstance(masks, (Tensor, Sequence)) or isinstance(masks, str):
         raise DTypeError(f"{who}: masks must be a bool tensor (V, h, w), or V of (h, w); got {describe(masks)}")
     if len(masks) == 0 or len(masks) != leading[0]:
         raise ShapeError(f"{who}: masks must be one for each of the {leading[0]} cameras; got {len(masks)}")

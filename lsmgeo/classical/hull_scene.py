@@ -15,9 +15,10 @@ from lsmgeo._checks import check_choice, check_whole
 from lsmgeo.cameras import CameraTensors, crop, resize, select, stack
 from lsmgeo.classical.gathering import resized, working_size
 from lsmgeo.classical.silhouettes import signed_distance, silhouettes
-from lsmgeo.classical.surface import SurfaceMesh, drop_specks, extract_mesh
+from lsmgeo.classical.surface import drop_specks, extract_mesh
 from lsmgeo.classical.tsdf import voxel_side
 from lsmgeo.classical.visual_hull import RULES, default_grid, visual_hull
+from lsmgeo.data.meshes import Mesh
 from lsmgeo.errors import OptionError
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ class HullScene:
     views: tuple[HullView, ...]
     occupancy: Tensor  # (D, H, W) bool
     grid: VoxelGrid
-    mesh: SurfaceMesh
+    mesh: Mesh
 
 
 def reconstruct_hull(
@@ -181,7 +182,7 @@ def hull_depth(occupancy: Tensor, grid: VoxelGrid, camera: CameraTensors) -> Ten
     return depth
 
 
-def colour_vertices(mesh: SurfaceMesh, views: Sequence[HullView], behind: float) -> SurfaceMesh:
+def colour_vertices(mesh: Mesh, views: Sequence[HullView], behind: float) -> Mesh:
     """A mesh with the mean of the colours that its vertices have in the photographs that see them.
 
     A view counts by the fourth power of the cosine between its ray and the surface's normal, so that those that look
@@ -197,7 +198,7 @@ def colour_vertices(mesh: SurfaceMesh, views: Sequence[HullView], behind: float)
     if not len(mesh.vertices):
         return mesh
     normals = np.asarray(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals)
-    points = torch.from_numpy(mesh.vertices)[None]
+    points = torch.from_numpy(mesh.vertices).float()[None]
     total, weight = torch.zeros(3, len(mesh.vertices)), torch.zeros(len(mesh.vertices))
     for view in views:
         cameras = stack([view.camera])
@@ -217,4 +218,4 @@ def colour_vertices(mesh: SurfaceMesh, views: Sequence[HullView], behind: float)
         weight += each
     mean = torch.where(weight > 0, total / weight.clamp_min(1e-12), 0.7)
     rounded = (mean.T * 255).round().clamp(0, 255).to(torch.uint8).numpy()
-    return SurfaceMesh(mesh.vertices, mesh.faces, rounded)
+    return Mesh(mesh.vertices, mesh.faces, colours=rounded)

@@ -16,8 +16,8 @@ from lsmgeo.classical.views import default_depth_range, select_neighbours
 from lsmgeo.errors import DataError, OptionError
 
 if TYPE_CHECKING:
-    from lsmgeo.classical.surface import SurfaceMesh
     from lsmgeo.data import PosedImages
+    from lsmgeo.data.meshes import Mesh
 
 __all__ = ["hull_results", "named_colour", "readable", "sweep_results"]
 
@@ -95,7 +95,7 @@ def sweep_results(
     if density is not None:
         options |= {"density": density}
     notes: tuple[str, ...] = ()
-    mesh: SurfaceMesh | None = None
+    mesh: Mesh | None = None
     views: tuple[Reconstruction, ...]
     if view is not None:
         one = _checked_view(scene, view, check, options)
@@ -269,7 +269,7 @@ def _able(scene: PosedImages, options: dict[str, Any], *, only: int | None = Non
     return able, (f"Not swept: {words}",)
 
 
-def _of_mesh(mesh: SurfaceMesh | None) -> list[tuple[str, str]]:
+def _of_mesh(mesh: Mesh | None) -> list[tuple[str, str]]:
     if mesh is None or not len(mesh.faces):
         return []
     return [("mesh", f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces")]

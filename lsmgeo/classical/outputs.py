@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from os import PathLike
 
     from lsmgeo.cameras import CameraTensors
-    from lsmgeo.classical.surface import SurfaceMesh
     from lsmgeo.data import PosedImages
+    from lsmgeo.data.meshes import Mesh
 
 __all__ = ["Looked", "Results", "file_names", "write_results"]
 
@@ -55,7 +55,7 @@ class Results(NamedTuple):
     views: tuple[Looked, ...]
     points: np.ndarray  # (N, 3); none of a hull, whose mesh says all
     colours: np.ndarray  # (N, 3) uint8
-    mesh: SurfaceMesh | None
+    mesh: Mesh | None
     used: tuple[int, ...] = ()  # photographs that helped, beside those of the views
 
 

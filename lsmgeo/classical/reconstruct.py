@@ -26,7 +26,7 @@ from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid
 
 if TYPE_CHECKING:
-    from lsmgeo.classical.surface import SurfaceMesh
+    from lsmgeo.data.meshes import Mesh
 
 __all__ = [
     "Reconstruction",
@@ -95,7 +95,7 @@ class SceneReconstruction:
     views: tuple[Reconstruction, ...]
     points: np.ndarray
     colours: np.ndarray
-    mesh: SurfaceMesh | None
+    mesh: Mesh | None
 
 
 def reconstruct_view(
@@ -343,15 +343,16 @@ class _Sweeper:
         return replace(one, mask=mask, points=points, colours=colours, error=error)
 
 
-def surface_of(swept: Sequence[Reconstruction], points: np.ndarray, resolution: int) -> SurfaceMesh:
+def surface_of(swept: Sequence[Reconstruction], points: np.ndarray, resolution: int) -> Mesh:
     """The surface that the kept pixels of several views show, in a box around the middle 98 % of their points."""
-    from lsmgeo.classical.surface import SurfaceMesh, extract_mesh
+    from lsmgeo.classical.surface import extract_mesh
     from lsmgeo.classical.tsdf import fuse_depth
+    from lsmgeo.data.meshes import Mesh
 
     low, high = np.percentile(points.astype(np.float64), (1, 99), axis=0)
     margin = 0.1 * (high - low).max()
     if not margin > 0:  # points at one place have no surface
-        return SurfaceMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
+        return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
     low, high = low - margin, high + margin
     voxel = (high - low).max() / resolution
     shape = np.maximum(np.ceil((high - low) / voxel).astype(int), 2)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.classical.surface import SurfaceMesh
+from lsmgeo.data.meshes import Mesh
 
 if TYPE_CHECKING:
     from trimesh.path import Path3D
@@ -39,7 +39,7 @@ class Model(NamedTuple):
 
     cameras: CameraTensors  # leading shape (V,)
     used: tuple[int, ...]  # cameras to be drawn in colour; the first looks at the start
-    surface: SurfaceMesh | None
+    surface: Mesh | None
     points: np.ndarray  # (N, 3)
     colours: np.ndarray  # (N, 3) uint8
 
@@ -137,7 +137,7 @@ def _frusta(
     return Path3D(entities, np.concatenate(lines).reshape(-1, 3), process=False, colors=np.concatenate(colours))
 
 
-def _thinned(surface: SurfaceMesh) -> SurfaceMesh:
+def _thinned(surface: Mesh) -> Mesh:
     """Vertices in the same cell of a lattice become one, the coarser the lattice the fewer faces are left."""
     cells = 512.0
     thin = surface
@@ -155,5 +155,5 @@ def _thinned(surface: SurfaceMesh) -> SurfaceMesh:
         faces = inverse[surface.faces]
         apart = (faces != np.roll(faces, 1, 1)).all(1)
         colours = None if surface.colours is None else mean(surface.colours).round().astype(np.uint8)
-        thin = SurfaceMesh(mean(surface.vertices), faces[apart], colours)
+        thin = Mesh(mean(surface.vertices), faces[apart], colours=colours)
     return thin

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,28 +11,16 @@ from torch import Tensor
 from lsmgeo._checks import check_finite, check_number, check_whole, describe
 from lsmgeo.classical.tsdf import Tsdf
 from lsmgeo.data.files import write_atomic
+from lsmgeo.data.mesh_topology import components
+from lsmgeo.data.meshes import Mesh, check_mesh
 from lsmgeo.errors import DataError, DTypeError, GridError, OptionError, ShapeError
 from lsmgeo.grids import VoxelGrid
 
 __all__ = ["SurfaceMesh", "drop_specks", "extract_mesh", "write_mesh"]
 
 
-@dataclass(frozen=True, eq=False)
-class SurfaceMesh:
-    """Triangles with a colour at every vertex.
-
-    Attributes:
-        vertices: (N, 3) float32, world.
-        faces: (M, 3) int64 vertex numbers; seen from outside, counter-clockwise.
-        colours: (N, 3) uint8 RGB, or None.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    colours: np.ndarray | None = None
-
-    def __repr__(self) -> str:
-        return f"SurfaceMesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
+# The name that coloured surfaces had of their own.
+SurfaceMesh = Mesh
 
 
 def extract_mesh(
@@ -43,7 +30,7 @@ def extract_mesh(
     level: float | None = None,
     least_weight: float = 0.0,
     specks: int = 0,
-) -> SurfaceMesh:
+) -> Mesh:
     """The surface of a signed distance, of an occupancy or of any field that is larger inside, by marching cubes.
 
     (Lorensen and Cline, SIGGRAPH 1987; in Lewiner's form, which is topologically right, from scikit-image.)
@@ -73,7 +60,7 @@ def extract_mesh(
         >>> from lsmgeo.classical import extract_mesh
         >>> ball, grid = scenes.Scene([scenes.sphere((0, 0, 0), 0.3)]), VoxelGrid(16)
         >>> extract_mesh(scenes.voxels([ball], grid)[0], grid)
-        SurfaceMesh(456 vertices, 908 faces)
+        Mesh(456 vertices, 908 faces)
     """
     who = "extract_mesh"
     if not isinstance(grid, VoxelGrid):
@@ -111,11 +98,11 @@ def extract_mesh(
     colours = None
     if isinstance(field, Tsdf) and field.colours is not None:
         colours = _colours_at(field.colours, index)
-    mesh = SurfaceMesh(vertices, np.ascontiguousarray(faces), colours)
+    mesh = Mesh(vertices, faces, colours=colours)
     return drop_specks(mesh, specks) if specks else mesh
 
 
-def drop_specks(mesh: SurfaceMesh, faces: int) -> SurfaceMesh:
+def drop_specks(mesh: Mesh, faces: int) -> Mesh:
     """Drop the connected pieces that have fewer faces, and vertices that no face uses.
 
     Args:
@@ -125,24 +112,18 @@ def drop_specks(mesh: SurfaceMesh, faces: int) -> SurfaceMesh:
     Returns:
         What is left, perhaps nothing.
     """
-    if not isinstance(mesh, SurfaceMesh):
-        raise DTypeError(f"drop_specks: mesh must be a SurfaceMesh; got {describe(mesh)}")
+    check_mesh("drop_specks", mesh, least=0)
     check_whole("drop_specks", "faces", faces, 0)
     if len(mesh.faces) == 0:
         return mesh
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    count = len(mesh.vertices)
     ends = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    links = coo_array((np.ones(len(ends), np.uint8), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    _, piece = connected_components(links, directed=False)
+    piece = components(len(mesh.vertices), ends[:, 0], ends[:, 1])
     piece_of_face = piece[mesh.faces[:, 0]]
     large = np.bincount(piece_of_face, minlength=piece.max() + 1) >= faces
     return _without_unused(mesh, mesh.faces[large[piece_of_face]])
 
 
-def write_mesh(path: str | os.PathLike[str], mesh: SurfaceMesh) -> Path:
+def write_mesh(path: str | os.PathLike[str], mesh: Mesh) -> Path:
     """Write a mesh as PLY or GLB, as the path's ending says, so that it is either wholly there or not at all.
 
     Convention:
@@ -162,8 +143,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: SurfaceMesh) -> Path:
     kind = Path(path).suffix[1:].lower()
     if kind not in ("ply", "glb"):
         raise OptionError(f"write_mesh: path must end in .ply or .glb; got {os.fspath(path)!r}")
-    if not isinstance(mesh, SurfaceMesh):
-        raise DTypeError(f"write_mesh: mesh must be a SurfaceMesh; got {describe(mesh)}")
+    check_mesh("write_mesh", mesh, least=0)
     if len(mesh.faces) == 0:
         raise DataError(path, "the mesh has no face")
     import trimesh
@@ -196,20 +176,20 @@ def _march(inside: np.ndarray, cells: np.ndarray | None) -> tuple[np.ndarray, np
         vertices, faces, _, _ = marching_cubes(inside, 0.0, mask=cells)
     except RuntimeError:  # no cell of the mask crosses the level
         return nothing
-    mesh = SurfaceMesh(vertices[:, ::-1].astype(np.float64), faces.astype(np.int64))
+    mesh = Mesh(vertices[:, ::-1], faces)
     mesh = _without_unused(mesh, _with_area(mesh))
     return mesh.vertices, mesh.faces
 
 
-def _with_area(mesh: SurfaceMesh) -> np.ndarray:
+def _with_area(mesh: Mesh) -> np.ndarray:
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     return mesh.faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0]
 
 
-def _without_unused(mesh: SurfaceMesh, faces: np.ndarray) -> SurfaceMesh:
+def _without_unused(mesh: Mesh, faces: np.ndarray) -> Mesh:
     used, faces = np.unique(faces, return_inverse=True)
     colours = None if mesh.colours is None else mesh.colours[used]
-    return SurfaceMesh(mesh.vertices[used], faces.reshape(-1, 3), colours)
+    return Mesh(mesh.vertices[used], faces.reshape(-1, 3), colours=colours)
 
 
 def _colours_at(colours: Tensor, index: np.ndarray) -> np.ndarray:

@@ -8,8 +8,8 @@ import torch
 
 from lsmgeo import VoxelGrid, data
 from lsmgeo.cameras import CameraTensors
-from lsmgeo.classical import SurfaceMesh
 from lsmgeo.classical.hull_scene import HullView, colour_vertices, hull_depth, reconstruct_hull
+from lsmgeo.data import Mesh
 from lsmgeo.errors import OptionError
 from tests.data.writers import make_scene, write_middlebury
 
@@ -51,7 +51,7 @@ def test_no_views_have_no_hull(tmp_path):
 def test_vertices_take_the_colours_of_pictures_up_to_the_border(x):
     at = torch.linalg.inv(K) @ torch.tensor([x, 5.0, 1.0]) * 2
     vertices = (at.numpy() + 0.01 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])).astype(np.float32)
-    mesh = SurfaceMesh(vertices, np.array([[0, 2, 1]]))
+    mesh = Mesh(vertices, np.array([[0, 2, 1]]))
     picture = torch.tensor([1.0, 0.6, 0.2])[:, None, None].expand(3, 12, 16)
     view = HullView(0, picture, camera_at(0.0), torch.ones(12, 16) > 0, torch.full((12, 16), 2.0), 1.0)
     coloured = colour_vertices(mesh, [view], 0.1)

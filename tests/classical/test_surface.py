@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from lsmgeo import VoxelGrid
-from lsmgeo.classical import SurfaceMesh, Tsdf, drop_specks, extract_mesh, write_mesh
-from lsmgeo.data import load_mesh
+from lsmgeo.classical import Tsdf, drop_specks, extract_mesh, write_mesh
+from lsmgeo.data import Mesh, load_mesh
 from lsmgeo.errors import DataError, DTypeError, GridError, OptionError, ShapeError
 from tests import oracle
 from tests.classical.seen import is_closed, volume
@@ -168,7 +168,7 @@ def test_files_are_read_back(tmp_path, ending, is_coloured):
     vertices = generator.normal(size=(5, 3)).astype(np.float32)
     faces = np.array([[0, 1, 2], [2, 1, 3], [0, 4, 1]])
     colours = np.array([[250, 10, 30]] * 5, np.uint8) if is_coloured else None
-    path = write_mesh(tmp_path / "deep" / f"mesh.{ending}", SurfaceMesh(vertices, faces, colours))
+    path = write_mesh(tmp_path / "deep" / f"mesh.{ending}", Mesh(vertices, faces, colours=colours))
     assert [item.name for item in path.parent.iterdir()] == [path.name]
     mesh = load_mesh(path)
     np.testing.assert_allclose(mesh.vertices[mesh.faces], vertices[faces], rtol=1e-6)
@@ -182,7 +182,7 @@ def test_an_independent_reader_agrees_on_vertex_colours(tmp_path):
 
     vertices = np.random.default_rng(4).normal(size=(4, 3)).astype(np.float32)
     colours = np.array([[1, 2, 3], [40, 50, 60], [255, 0, 128], [9, 99, 199]], np.uint8)
-    mesh = SurfaceMesh(vertices, np.array([[0, 1, 2], [3, 2, 1]]), colours)
+    mesh = Mesh(vertices, np.array([[0, 1, 2], [3, 2, 1]]), colours=colours)
     for ending in ("ply", "glb"):
         read = trimesh.load(write_mesh(tmp_path / f"a.{ending}", mesh), force="mesh", process=False)
         np.testing.assert_allclose(read.vertices, vertices, rtol=1e-6)
@@ -190,12 +190,12 @@ def test_an_independent_reader_agrees_on_vertex_colours(tmp_path):
 
 
 def test_what_cannot_be_written_is_refused_and_leaves_nothing(tmp_path):
-    mesh = SurfaceMesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]))
+    mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]))
     with pytest.raises(OptionError, match=r"must end in \.ply or \.glb"):
         write_mesh(tmp_path / "a.obj", mesh)
     with pytest.raises(DataError, match="no face"):
-        write_mesh(tmp_path / "a.ply", SurfaceMesh(mesh.vertices, np.zeros((0, 3), np.int64)))
-    with pytest.raises(DTypeError, match="SurfaceMesh"):
+        write_mesh(tmp_path / "a.ply", Mesh(mesh.vertices, np.zeros((0, 3), np.int64)))
+    with pytest.raises(DTypeError, match="write_mesh: mesh must be a"):
         write_mesh(tmp_path / "a.ply", None)
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="cannot be written"):

@@ -10,7 +10,7 @@ import torch
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.classical.report_model import MOST_FACES, Model, _thinned, make_viewer
 from lsmgeo.classical.report_page import ReportPicture, ReportView, make_page
-from lsmgeo.classical.surface import SurfaceMesh
+from lsmgeo.data import Mesh
 from tests.cli.browser import Browser
 
 HOSTILE = "<script>document.title='taken'</script>\"'&{{ 7 * 7 }}.png"
@@ -38,7 +38,7 @@ def square():
         vertices += [(x0, -1, z), (x1, -1, z), (x1, 1, z), (x0, 1, z)]
         faces += [(first, first + 1, first + 2), (first, first + 2, first + 3)]
         colours += [colour] * 4
-    return SurfaceMesh(np.array(vertices, np.float32), np.array(faces), np.array(colours, np.uint8))
+    return Mesh(np.array(vertices, np.float32), np.array(faces), colours=np.array(colours, np.uint8))
 
 
 def make_views(count, side=120):
@@ -223,7 +223,7 @@ def test_surfaces_of_many_faces_are_thinned():
     a, b, c, d = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, 1:].ravel(), index[1:, :-1].ravel()
     faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
     colours = np.full((len(vertices), 3), (10, 20, 30), np.uint8)
-    thin = _thinned(SurfaceMesh(vertices, faces, colours))
+    thin = _thinned(Mesh(vertices, faces, colours=colours))
     assert MOST_FACES / 4 < len(thin.faces) <= MOST_FACES
     assert (thin.colours == (10, 20, 30)).all()
     np.testing.assert_allclose(thin.vertices[:, 2], 0.1 * np.sin(6 * thin.vertices[:, 0]), atol=2e-3)

@@ -48,8 +48,8 @@ def accessor(index, **changes):
 
 
 ATTACKS = [
-    ("empty.obj", b"", "at least one face"),
-    ("points.obj", b"v 0 0 0\nv 1 0 0\n", "at least one face"),
+    ("empty.obj", b"", "holds no face"),
+    ("points.obj", b"v 0 0 0\nv 1 0 0\n", "holds no face"),
     ("index.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "names vertex 4, of 3"),
     ("back.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\n", "names vertex -4, of 3"),
     ("zero.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "names vertex 0"),
@@ -126,7 +126,7 @@ ATTACKS = [
     ("matrix.glb", changed(nodes=[{"mesh": 0, "matrix": [1, 2]}]), "damaged"),
     ("draco.glb", changed(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco"),
     ("strip.glb", changed(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 5}]}]), "strips or fans"),
-    ("lines.glb", changed(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 1}]}]), "at least one face"),
+    ("lines.glb", changed(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 1}]}]), "holds no face"),
     ("list.gltf", b"[]", "damaged"),
     ("nesting.gltf", b"[" * 200_000, "damaged"),
     ("text.gltf", b"not json", "damaged"),

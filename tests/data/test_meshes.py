@@ -124,7 +124,8 @@ def test_a_vertex_that_no_face_uses_does_not_move_the_box():
         (([[0, 0, 0]], writers.FANS), DTypeError, "vertices must be a numpy array"),
         ((writers.CUBE, writers.FANS.astype(float)), DTypeError, "faces must be a numpy array"),
         ((writers.CUBE[:, :2], writers.FANS), ShapeError, r"vertices must be \(N, 3\)"),
-        ((writers.CUBE, writers.FANS[:0]), ShapeError, "at least one face"),
+        ((writers.CUBE, writers.FANS, None, np.zeros((7, 3), np.uint8)), ShapeError, r"colours must be \(8, 3\)"),
+        ((writers.CUBE, writers.FANS, None, np.zeros((8, 3), np.uint16)), DTypeError, "colours must be uint8"),
         ((writers.CUBE[:7], writers.FANS), OptionError, "0 to 6"),
         ((writers.CUBE, writers.FANS - 1), OptionError, "0 to 7"),
         ((writers.CUBE + np.inf, writers.FANS), OptionError, "finite"),
@@ -146,6 +147,8 @@ def test_options_are_checked(tmp_path):
         normalise(Mesh(np.ones((3, 3)), np.array([[0, 1, 2]])))
     with pytest.raises(DTypeError, match="from_trimesh"):
         normalise(trimesh.creation.box())
+    with pytest.raises(ShapeError, match="at least one face"):
+        normalise(Mesh(writers.CUBE, writers.FANS[:0]))
     with pytest.raises(OptionError, match="max_faces"):
         load_mesh(tmp_path / "cube.obj", max_faces=0)
     with pytest.raises(DataError, match="limit of 5"):

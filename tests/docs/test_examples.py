@@ -98,7 +98,7 @@ def test_pixels_of_an_analytic_ball_lie_on_it_to_rounding(run):
 
 def test_a_tenth_of_the_faces_matters_little_to_the_vote(run):
     names = run("mesh_voxels")
-    assert names["overlap"](names["before"], names["after"]) > 0.98
+    assert names["overlap"](names["whole"], names["voted"]) > 0.98
 
 
 def test_two_shapes_of_a_category_share_less_than_a_third(run):

@@ -104,8 +104,8 @@ def _checked(path: Path, parsed: Mapping[str, np.ndarray], max_faces: int) -> Me
         whole = Mesh(parsed["vertices"], parsed["faces"])
     except (LsmGeoError, KeyError) as error:
         raise DataError(path, f"holds no mesh ({error})") from error
-    if len(whole.faces) > max_faces:
-        raise DataError(path, f"has {len(whole.faces)} faces, the limit is {max_faces}")
+    if not len(whole.faces) or len(whole.faces) > max_faces:
+        raise DataError(path, f"holds no face, or more than the limit of {max_faces}; got {len(whole.faces)}")
     if np.abs(whole.vertices).max() > FARTHEST:
         raise DataError(path, "vertices must be at most 1e15 from 0")
     used, faces = np.unique(whole.faces, return_inverse=True)

@@ -27,11 +27,12 @@ class Mesh:
 
     Attributes:
         vertices: (N, 3) float64, finite, world units.
-        faces: (F, 3) int64 vertex numbers, F >= 1; seen from outside, counter-clockwise.
+        faces: (F, 3) int64 vertex numbers; seen from outside, counter-clockwise.
         face_colours: (F, 3) float32 RGB in [0, 1], or None.
+        colours: (N, 3) uint8 RGB of the vertices, or None.
 
     Raises:
-        ShapeError: a wrong shape, no face.
+        ShapeError: a wrong shape.
         DTypeError: no array of numbers.
         OptionError: a face that names no vertex, a number that is not finite, a colour outside [0, 1].
 
@@ -45,29 +46,33 @@ class Mesh:
     vertices: np.ndarray
     faces: np.ndarray
     face_colours: np.ndarray | None = None
+    colours: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         """Check and normalise the fields."""
         vertices = _array("vertices", self.vertices, "(N, 3) numbers", "fiu", np.float64)
         faces = _array("faces", self.faces, "(F, 3) whole numbers", "iu", np.int64)
-        if not 1 <= len(faces) <= LARGEST_COUNT or len(vertices) > LARGEST_COUNT:
-            raise ShapeError(f"Mesh: expected at least one face, fewer than 2^31; got {len(faces)}")
+        if max(len(faces), len(vertices)) > LARGEST_COUNT:
+            raise ShapeError(f"Mesh: expected fewer than 2^31 vertices and faces; got {len(vertices)}, {len(faces)}")
         if not np.isfinite(vertices).all():
             raise OptionError("Mesh: vertices must be finite; got a NaN or an infinity")
-        if faces.min() < 0 or faces.max() >= len(vertices):
+        if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
             raise OptionError(
                 f"Mesh: faces must name vertices 0 to {len(vertices) - 1}; got {faces.min()}..{faces.max()}"
             )
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
-        if self.face_colours is None:
-            return
-        colours = _array("face_colours", self.face_colours, "(F, 3) numbers", "f", np.float32)
-        if len(colours) != len(faces):
-            raise ShapeError(f"Mesh: face_colours must be ({len(faces)}, 3), one a face; got {colours.shape}")
-        if not ((colours >= 0) & (colours <= 1)).all():
-            raise OptionError(f"Mesh: face_colours must be in [0, 1]; got {colours.min()}..{colours.max()}")
-        object.__setattr__(self, "face_colours", colours)
+        for name, of, kind, dtype in (("face_colours", faces, "f", np.float32), ("colours", vertices, "u", np.uint8)):
+            if (value := getattr(self, name)) is None:
+                continue
+            colours = _array(name, value, f"({len(of)}, 3) {np.dtype(dtype)}", kind, dtype)
+            if len(colours) != len(of):
+                raise ShapeError(f"Mesh: {name} must be ({len(of)}, 3); got {colours.shape}")
+            if kind == "u" and value.dtype != np.uint8:
+                raise DTypeError(f"Mesh: {name} must be uint8; got {value.dtype}")
+            if kind == "f" and not ((colours >= 0) & (colours <= 1)).all():
+                raise OptionError(f"Mesh: {name} must be in [0, 1]; got {colours.min()}..{colours.max()}")
+            object.__setattr__(self, name, colours)
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
@@ -92,10 +97,12 @@ def _array(name: str, value: object, expected: str, kinds: str, dtype: type) -> 
     return np.ascontiguousarray(value, dtype)
 
 
-def check_mesh(who: str, mesh: object) -> None:
-    """Require a `Mesh`."""
+def check_mesh(who: str, mesh: object, *, least: int = 1) -> None:
+    """Require a `Mesh` of so many faces."""
     if not isinstance(mesh, Mesh):
         raise DTypeError(f"{who}: mesh must be a lsmgeo.data.Mesh (see from_trimesh); got {describe(mesh)}")
+    if len(mesh.faces) < least:
+        raise ShapeError(f"{who}: mesh must have at least one face; got {mesh}")
 
 
 def from_trimesh(mesh: trimesh.Trimesh) -> Mesh:
@@ -126,6 +133,7 @@ def normalise(mesh: Mesh, *, to: str = "diagonal") -> Mesh:
 
     Raises:
         DTypeError: not a `Mesh`.
+        ShapeError: a mesh without faces.
         OptionError: another `to`, or a mesh that is a single point.
 
     Example:

@@ -22,6 +22,8 @@ __all__ = ["PATTERN", "PLACEMENTS", "is_binvox", "read_binvox"]
 PATTERN = "*.binvox"
 PLACEMENTS = ("header", "centred")
 SIGNATURE = b"#binvox 1"
+# The lines of a header, and how many values each has.
+LENGTHS = {"dim": 3, "translate": 3, "scale": 1}
 MAX_HEADER_BYTES = 1024
 MAX_SIDE = 1024
 MAX_VOXELS = 1 << 28
@@ -86,17 +88,11 @@ def read_binvox(path: str | Path, *, placement: str = "header") -> Voxels:
 def _read_header(content: bytes, path: Path) -> tuple[int, list[float], float, int]:
     """Voxels a side, translate, scale, and where the runs begin."""
     found: dict[str, Sequence[float]] = {}
-    start, first = 0, True
-    while True:
-        end = content.find(b"\n", start, MAX_HEADER_BYTES)
-        if end < 0:
-            raise DataError(path, f"has no header of a binvox file in its first {MAX_HEADER_BYTES} bytes")
-        line, start = content[start:end], end + 1
-        if first:
-            if line.split() != SIGNATURE.split():
-                raise DataError(path, "is no binvox file: it begins with another line than '#binvox 1'")
-            first = False
-            continue
+    begin = 0
+    for number, line in enumerate(content[:MAX_HEADER_BYTES].split(b"\n")[:-1]):
+        begin += len(line) + 1
+        if number == 0 and line.split() != SIGNATURE.split():
+            raise DataError(path, "is no binvox file: it begins with another line than '#binvox 1'")
         try:
             name, *tokens = line.decode("ascii").partition("#")[0].split() or [""]
         except UnicodeDecodeError as error:
@@ -104,8 +100,13 @@ def _read_header(content: bytes, path: Path) -> tuple[int, list[float], float, i
         if name == "data" and not tokens:
             break
         if name:
-            found[name] = _read_line(name, tokens, found, path)
-    missing = [name for name in ("dim", "translate", "scale") if name not in found]
+            if name in found or len(tokens) != LENGTHS.get(name):
+                reason = f"has a header line that is none, or is there twice: {name[:40]!r} with {len(tokens)} values"
+                raise DataError(path, reason)
+            found[name] = (parse_ints if name == "dim" else parse_floats)(tokens, path, name)
+    else:
+        raise DataError(path, f"has no header of a binvox file in its first {MAX_HEADER_BYTES} bytes")
+    missing = [name for name in LENGTHS if name not in found]
     if missing:
         raise DataError(path, f"has a header without {' and '.join(missing)}")
     sides, (scale,) = [int(side) for side in found["dim"]], found["scale"]
@@ -117,13 +118,4 @@ def _read_header(content: bytes, path: Path) -> tuple[int, list[float], float, i
         )
     if not 0 < scale <= 1e12 or max(map(abs, found["translate"])) > 1e12:
         raise DataError(path, f"has scale {scale:g}, translate {found['translate']}: no place for a cube")
-    return sides[0], list(found["translate"]), scale, start
-
-
-def _read_line(name: str, tokens: list[str], found: dict[str, Sequence[float]], path: Path) -> Sequence[float]:
-    wanted = {"dim": 3, "translate": 3, "scale": 1}.get(name)
-    if wanted is None or name in found or len(tokens) != wanted:
-        raise DataError(
-            path, f"has a header line that is none, or is there twice: {name[:40]!r} with {len(tokens)} values"
-        )
-    return parse_ints(tokens, path, name) if name == "dim" else parse_floats(tokens, path, name)
+    return sides[0], list(found["translate"]), scale, begin

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -28,18 +28,6 @@ class RayHits(NamedTuple):
     face: np.ndarray
     distance: np.ndarray
     weights: np.ndarray
-
-
-class RayCaster(Protocol):
-    """A mesh made ready for rays."""
-
-    def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> RayHits:
-        """Where rays, origins and directions (N, 3) float64, first meet the mesh in front of their origins."""
-        ...
-
-    def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(N,) bool, whether rays meet the mesh at all in front of their origins."""
-        ...
 
 
 def make_caster(vertices: np.ndarray, faces: np.ndarray, backend: str = "auto") -> RayCaster:
@@ -100,7 +88,10 @@ class EmbreeCaster:
         return start, along, begin
 
     def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> RayHits:
-        """Where rays first meet the mesh; the distance is computed again in float64 with the triangle found."""
+        """Where rays, origins and directions (N, 3) float64, first meet the mesh in front of their origins.
+
+        The distance is computed again in float64 with the triangle found.
+        """
         start, along, begin = self._scaled(origins, directions)
         found = self.scene.run(start.astype(np.float32), along.astype(np.float32), output=True)
         face, distance = found["primID"].astype(np.int64), found["tfar"].astype(np.float64)
@@ -115,7 +106,7 @@ class EmbreeCaster:
         return RayHits(face, begin + distance, np.stack((found["u"], found["v"]), 1).astype(np.float64))
 
     def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Whether rays meet the mesh at all."""
+        """(N,) bool, whether rays meet the mesh at all in front of their origins."""
         start, along, _ = self._scaled(origins, directions)
         return self.scene.run(start.astype(np.float32), along.astype(np.float32), query="OCCLUDED") >= 0
 
@@ -124,16 +115,16 @@ class NumpyCaster:
     """Rays by a tree of boxes in numpy, in float64; far slower than embree."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
-        corners = vertices[faces]
-        low, high = corners.min(1), corners.max(1)
-        order = np.argsort(_morton(0.5 * low + 0.5 * high), kind="stable")
-        leaves = 1 << max(0, int(np.ceil(np.log2(max(len(faces), 1) / LEAF))))
-        slots = np.full(leaves * LEAF, -1, np.int64)
-        slots[: len(order)] = order
-        self.slots = slots.reshape(leaves, LEAF)
-        # An empty slot is a box of NaN, which no ray meets and which adds nothing to the boxes above it.
-        self.corners = np.concatenate((corners, np.full((1, 3, 3), np.nan)))
-        low, high = (np.concatenate((side, np.full((1, 3), np.nan))) for side in (low, high))
+        # An empty slot (-1) is a box of NaN, which no ray meets and which adds nothing to the boxes above it.
+        self.corners = np.concatenate((vertices[faces], np.full((1, 3, 3), np.nan)))
+        low, high = self.corners.min(1), self.corners.max(1)
+        slots = np.full((1, LEAF << max(0, int(np.ceil(np.log2(max(len(faces), 1) / LEAF))))), -1, np.int64)
+        slots[0, : len(faces)] = np.arange(len(faces))
+        while slots.shape[1] > LEAF:
+            # Each box is cut at the median of its triangles, along another axis at each level; NaN sorts last.
+            middles = (0.5 * low + 0.5 * high)[slots, len(slots).bit_length() % 3]
+            slots = np.take_along_axis(slots, np.argsort(middles, axis=1, kind="stable"), 1).reshape(2 * len(slots), -1)
+        self.slots = slots
         levels = [(np.fmin.reduce(low[self.slots], axis=1), np.fmax.reduce(high[self.slots], axis=1))]
         while len(levels[0][0]) > 1:
             below = levels[0]
@@ -202,17 +193,9 @@ class NumpyCaster:
         return self.first_hits(origins, directions).face >= 0
 
 
+RayCaster: TypeAlias = EmbreeCaster | NumpyCaster
+
+
 def row_dots(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Dot products (N,) of the rows of two arrays (N, 3); einsum needs no array of products."""
     return np.einsum("ni,ni->n", first, second)
-
-
-def _morton(points: np.ndarray) -> np.ndarray:
-    """Places along a curve that visits near points one after another."""
-    low, size = points.min(0), np.maximum(np.ptp(points, 0).max(), 1e-300)
-    cells = np.minimum((points - low) / size * 1024, 1023).astype(np.int64)
-    code = np.zeros(len(points), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return code

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -50,22 +49,13 @@ def test_an_orientation_in_exif_is_not_applied(tmp_path):
     assert (read_image(tmp_path / "a.jpg")[:, :, 0] > 127).tolist() == [[False] * 8 + [True] * 8] * 8
 
 
-@pytest.mark.parametrize("filtered", [False, True])
-def test_depth_may_have_a_resolution_and_comments(tmp_path, filtered):
+def test_depth_may_have_a_resolution_and_comments(tmp_path):
     steps = np.arange(35, dtype=np.uint16).reshape(5, 7) * 1500
     comments = PngInfo()
     comments.add_text("Software", "a depth camera")
     comments.add(b"gAMA", (45455).to_bytes(4, "big"))
     comments.add(b"tRNS", (3000).to_bytes(2, "big"))
     Image.fromarray(steps).save(tmp_path / "a.png", pnginfo=comments, dpi=(96, 96))
-    if not filtered:
-        content = (tmp_path / "a.png").read_bytes()
-        index = content.index(b"IDAT") - 4
-        rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in steps)
-        body = b"IDAT" + zlib.compress(rows)
-        end = b"\0\0\0\0IEND" + zlib.crc32(b"IEND").to_bytes(4, "big")
-        chunk = (len(body) - 4).to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big")
-        (tmp_path / "a.png").write_bytes(content[:index] + chunk + end)
     expected = steps * np.float32(0.001)
     np.testing.assert_allclose(DepthPng(tmp_path / "a.png", 0.001).read((5, 7)), expected, rtol=1e-6)
 

@@ -6,6 +6,7 @@ from lsmgeo.data.cameras_json import read_cameras_json
 from lsmgeo.data.colmap import read_colmap
 from lsmgeo.data.convert_set import convert_set
 from lsmgeo.data.depth_files import DepthFile, DepthPng
+from lsmgeo.data.depth_sensors import read_rgbd, read_seven_scenes
 from lsmgeo.data.detect import FORMATS, Format, detect, open_scene
 from lsmgeo.data.files import atomic_file, write_atomic, write_point_cloud
 from lsmgeo.data.images import read_image
@@ -20,10 +21,8 @@ from lsmgeo.data.middlebury import read_middlebury
 from lsmgeo.data.posed import Observations, PosedImages, SparsePoints, Voxels
 from lsmgeo.data.r2n2 import read_r2n2
 from lsmgeo.data.render_set import Made, render_set
-from lsmgeo.data.rgbd import read_rgbd
 from lsmgeo.data.sample import Batch, Sample, check_sample, collate
 from lsmgeo.data.scene_writers import write_cameras_json, write_colmap, write_transforms
-from lsmgeo.data.seven_scenes import read_seven_scenes
 from lsmgeo.data.shard_reading import ShardSet
 from lsmgeo.data.shards import hash_settings, verify_shard, write_shard
 from lsmgeo.data.sources import Recipe

@@ -10,6 +10,7 @@ from lsmgeo.data.binvox import is_binvox, read_binvox
 from lsmgeo.data.calibration import is_calibration, read_calibration
 from lsmgeo.data.cameras_json import is_cameras_json, read_cameras_json
 from lsmgeo.data.colmap import model_folder, read_colmap
+from lsmgeo.data.depth_sensors import is_rgbd, is_seven_scenes, read_rgbd, read_seven_scenes
 from lsmgeo.data.files import refuse_unreadable
 from lsmgeo.data.images import SUFFIXES
 from lsmgeo.data.llff import is_llff, read_llff
@@ -17,8 +18,6 @@ from lsmgeo.data.lsm_release import is_lsm, read_lsm
 from lsmgeo.data.middlebury import is_middlebury, read_middlebury
 from lsmgeo.data.posed import PosedImages
 from lsmgeo.data.r2n2 import is_r2n2, read_r2n2
-from lsmgeo.data.rgbd import is_rgbd, read_rgbd
-from lsmgeo.data.seven_scenes import is_seven_scenes, read_seven_scenes
 from lsmgeo.data.stereo_pairs import is_stereo_pair, read_stereo_pair
 from lsmgeo.data.strecha import is_strecha, read_strecha
 from lsmgeo.data.transforms_json import is_transforms, read_transforms

@@ -25,10 +25,10 @@ def chunk(kind, content, crc=None):
     return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc)
 
 
-def png(width=16, height=12, bits=8, colour=6, interlace=0, data=None, before=b"", after=b""):
+def png(width=16, height=12, bits=8, colour=6, interlace=0, data=None, before=b""):
     data = zlib.compress(bytes(height * (1 + 4 * width))) if data is None else data
     start = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, interlace)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", start) + before + chunk(b"IDAT", data) + after + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", start) + before + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
 PNGS = {
@@ -88,9 +88,7 @@ def test_mutated_pictures_are_refused_or_read(kind):
         elif number % 3 == 1:
             damaged = header + chunk(b"IDAT", mutated(rng, data)) + chunk(b"IEND", b"")
         else:
-            rows = np.frombuffer(raw, np.uint8).copy().reshape(12, -1)
-            rows[:, 0] = rng.integers(0, 5 + (number % 2), 12)  # any filters, half of the time one that does not exist
-            damaged = header + chunk(b"IDAT", zlib.compress(rows.tobytes())) + chunk(b"IEND", b"")
+            damaged = header + chunk(b"IDAT", zlib.compress(mutated(rng, raw))) + chunk(b"IEND", b"")
 
         def run():
             found = decode_png(damaged, (12, 16), kind, "memory")

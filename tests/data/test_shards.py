@@ -7,7 +7,6 @@ import os
 import pickle
 import tarfile
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -416,16 +415,9 @@ def test_pictures_of_other_writers(kind):
     pixels = smooth.astype(kind.dtype)
     ours = encode_png(pixels)
     np.testing.assert_array_equal(np.array(Image.open(io.BytesIO(ours))), pixels)
-    written = [ours]
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, "PNG")
-    written.append(stream.getvalue())
-    filters = (cv2.IMWRITE_PNG_FILTER_NONE, cv2.IMWRITE_PNG_FILTER_SUB, cv2.IMWRITE_PNG_FILTER_UP,
-               cv2.IMWRITE_PNG_FILTER_AVG, cv2.IMWRITE_PNG_FILTER_PAETH, cv2.IMWRITE_PNG_ALL_FILTERS)  # fmt: skip
-    for row_filter in filters:
-        swapped = cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA) if kind is RGBA else pixels
-        written.append(cv2.imencode(".png", swapped, [cv2.IMWRITE_PNG_FILTER, row_filter])[1].tobytes())
-    for content in written:
+    for content in (ours, stream.getvalue()):
         np.testing.assert_array_equal(decode_png(content, (37, 29), kind, "memory"), pixels)
     with pytest.raises(ValueError, match="pixels must be"):
         encode_png(pixels.astype(np.float32))

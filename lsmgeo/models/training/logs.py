@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lsmgeo.data.files import write_atomic
+from lsmgeo.data.images import encode_png
 from lsmgeo.errors import DataError
 from lsmgeo.models.training.evaluating import Evaluation
 from lsmgeo.models.training.pictures import draw_examples
@@ -137,14 +138,8 @@ class RunLog:
         """A picture (h, w, 3): for TensorBoard, and as ``pictures/NAME_STEP.png``."""
         if not self.is_writer:
             return
-        import io
-
-        from PIL import Image
-
-        content = io.BytesIO()
-        Image.fromarray(picture).save(content, "PNG")
         try:
-            write_atomic(self.folder / "pictures" / f"{name}_{step:08d}.png", content.getvalue())
+            write_atomic(self.folder / "pictures" / f"{name}_{step:08d}.png", encode_png(picture))
         except DataError as error:
             self._warn("pictures", f"{error}; the run goes on")
         if self._board is not None:

@@ -126,4 +126,4 @@ def fill(_: str) -> None:
 
 def leftovers(folder: Path) -> list[str]:
     """What does not belong into a run's folder of checkpoints."""
-    return sorted(item.name for item in folder.iterdir() if item.name.endswith(".tmp") or ".old-" in item.name)
+    return sorted(item.name for item in folder.iterdir() if ".tmp" in item.name or ".old-" in item.name)

@@ -225,6 +225,14 @@ def test_a_kill_while_a_checkpoint_is_replaced_loses_none(run, tmp_path):
         assert load_latest(copy).step == 2
 
 
+def test_what_a_killed_run_of_an_earlier_version_left_is_cleared(run, third):
+    (run / "checkpoints" / "step_00000003.tmp-17").mkdir()
+    (run / "checkpoints" / "LATEST.tmp-17").write_bytes(b"step")
+    (run / "checkpoints" / "step_00000002").rename(run / "checkpoints" / "step_00000002.old-17")
+    third.save(run / "checkpoints")
+    assert sorted(os.listdir(run / "checkpoints")) == ["LATEST", *(f"step_0000000{step}" for step in (1, 2, 3))]
+
+
 def test_a_disk_that_is_full_at_any_moment_of_a_save_is_told_and_harms_nothing(run, third, tmp_path):
     calls = count_points(third, run, tmp_path)
     told = []

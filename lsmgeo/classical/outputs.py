@@ -15,9 +15,8 @@ from lsmgeo.classical.report_model import Model
 from lsmgeo.classical.report_page import ReportPicture, ReportView, make_page
 from lsmgeo.classical.surface import write_mesh
 from lsmgeo.data.cameras_json import FORMAT, NAME, VERSION
-from lsmgeo.data.files import write_atomic, write_point_cloud
+from lsmgeo.data.files import refusing, write_atomic, write_point_cloud
 from lsmgeo.data.images import encode_png
-from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -134,10 +133,8 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
 
 
 def _remove(path: Path) -> None:
-    try:
+    with refusing(path, "removed"):
         path.unlink(missing_ok=True)
-    except OSError as error:
-        raise DataError(path, f"cannot be removed ({error.strerror})") from error
 
 
 def file_names(names: Sequence[str]) -> list[str]:

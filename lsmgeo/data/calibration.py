@@ -242,7 +242,8 @@ def _lenses(entries: Entries, file: Path) -> Iterator[tuple[str, CalibratedLens]
         views = entries.matrices.get("extrinsicparameters") if number == "" else None
         if views is not None and views.shape[1] != 6:
             raise DataError(file, f"{name}: extrinsic_parameters must have 6 columns; got {views.shape[1]}")
-        yield name, CalibratedLens(kind, matrix, tuple(map(float, coefficients)), _size(entries, file), views, file)
+        size = _whole(entries, ("imageheight", "imagewidth"), MAX_SIDE, file)
+        yield name, CalibratedLens(kind, matrix, tuple(map(float, coefficients)), size, views, file)
 
 
 def _one_of(matrices: dict[str, np.ndarray], names: tuple[str, ...], number: str, file: Path) -> np.ndarray | None:
@@ -259,10 +260,6 @@ def _whole(entries: Entries, names: tuple[str, str], most: int, file: Path) -> t
     if any(value != int(value) or not 1 <= value <= most for value in values):
         raise DataError(file, f"{names[0]} and {names[1]} must be whole numbers from 1 to {most}; got {values}")
     return int(values[0]), int(values[1])
-
-
-def _size(entries: Entries, file: Path) -> tuple[int, int] | None:
-    return _whole(entries, ("imageheight", "imagewidth"), MAX_SIDE, file)
 
 
 def _board(entries: Entries, file: Path) -> Board | None:

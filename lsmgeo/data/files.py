@@ -90,7 +90,8 @@ def read_bytes(path: Path, limit: int) -> bytes:
         if not path.is_file():
             raise DataError(path, "no such file")
         with path.open("rb") as stream:
-            content = stream.read(limit + 1)
+            # Reading up to a limit takes memory for all of it.
+            content = stream.read(min(os.fstat(stream.fileno()).st_size, limit) + 1)
     if len(content) > limit:
         raise DataError(path, f"is larger than the limit of {limit} bytes")
     return content

@@ -12,6 +12,7 @@ from lsmgeo.data.files import read_text
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
 __all__ = ["peek_json", "read_json", "take_array", "take_number", "take_text"]
@@ -50,7 +51,7 @@ def _parse(path: Path) -> Any:
         raise DataError(path, f"is not JSON that can be used ({error})") from error
 
 
-def take_number(values: dict[str, Any], key: str, path: Path, where: str, *, beyond: float = 1e12) -> float:
+def take_number(values: Mapping[str, Any], key: str, path: Path, where: str, *, beyond: float = 1e12) -> float:
     """The number under a key, between -``beyond`` and ``beyond``.
 
     Raises:

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lsmgeo.data.assembling import assemble, check_intrinsics, check_picture, make_cameras
-from lsmgeo.data.depth_files import DepthFile
+from lsmgeo.data.depth_files import DepthFile, read_pfm
 from lsmgeo.data.files import child, parse_floats, parse_ints, read_text, refuse_unreadable
 from lsmgeo.data.images import image_size
-from lsmgeo.data.pfm import read_pfm
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import ChainMap
 from pathlib import Path
 from typing import Any, Literal
 
@@ -145,23 +146,16 @@ class _Stated:
     """What a file says of one frame's camera: in the frame itself, else for all."""
 
     def __init__(self, file: Path, where: str, values: dict[str, Any], frame: dict[str, Any]):
-        self.file, self.where, self.scopes = file, where, (frame, values)
+        self.file, self.where, self.frame, self.all = file, where, frame, ChainMap(frame, values)
         for key in REFUSED:
-            if self.holds(key) and self._value(key) is not False:
+            if self.all.get(key, False) is not False:
                 raise DataError(file, f"{where}: {key} describes a camera that is neither pinhole nor OpenCV's")
-
-    def _value(self, key: str) -> Any:
-        return next((scope[key] for scope in self.scopes if key in scope), None)
-
-    def holds(self, key: str) -> bool:
-        """Whether a key is there at all."""
-        return any(key in scope for scope in self.scopes)
 
     def number(self, key: str, default: float | None = None, beyond: float = MAX_PARAMETER) -> float:
         """A number, or the default where there is none."""
-        if default is not None and not self.holds(key):
+        if default is not None and key not in self.all:
             return default
-        return take_number({key: self._value(key)}, key, self.file, self.where, beyond=beyond)
+        return take_number(self.all, key, self.file, self.where, beyond=beyond)
 
     def size(self, picture: tuple[int, int]) -> tuple[int, int]:
         """(height, width), the picture's where the file says nothing."""
@@ -184,21 +178,22 @@ class _Stated:
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
     def _focal(self, axis: str, side: int) -> float | None:
-        for scope in self.scopes:
-            if f"fl_{axis}" in scope:
-                focal = take_number(scope, f"fl_{axis}", self.file, self.where, beyond=MAX_PARAMETER)
-            elif f"camera_angle_{axis}" in scope:
-                angle = take_number(scope, f"camera_angle_{axis}", self.file, self.where)
-                if not 1e-6 < angle < math.pi:
-                    reason = f"camera_angle_{axis} must lie between 0 and pi (radians); got {angle:g}"
-                    raise DataError(self.file, f"{self.where}: {reason}")
-                focal = 0.5 * side / math.tan(0.5 * angle)
-            else:
-                continue
-            if not focal > 0:
-                raise DataError(self.file, f"{self.where}: focal lengths must be positive; got {focal:g}")
-            return focal
-        return None
+        length, across = f"fl_{axis}", f"camera_angle_{axis}"
+        # What a frame says of its lens goes before what is said for all, in whichever words.
+        scope = self.frame if length in self.frame or across in self.frame else self.all
+        if length in scope:
+            focal = take_number(scope, length, self.file, self.where, beyond=MAX_PARAMETER)
+        elif across in scope:
+            angle = take_number(scope, across, self.file, self.where)
+            if not 1e-6 < angle < math.pi:
+                reason = f"{across} must lie between 0 and pi (radians); got {angle:g}"
+                raise DataError(self.file, f"{self.where}: {reason}")
+            focal = 0.5 * side / math.tan(0.5 * angle)
+        else:
+            return None
+        if not focal > 0:
+            raise DataError(self.file, f"{self.where}: focal lengths must be positive; got {focal:g}")
+        return focal
 
     def lens(self, intrinsics: np.ndarray, size: tuple[int, int]) -> Lens | None:
         """The lens, None where it is straight."""
@@ -214,10 +209,10 @@ class _Stated:
         return Lens(kind, K, coefficients, *size)
 
     def _kind(self) -> Literal["perspective", "fisheye"]:
-        model = self._value("camera_model")
+        model, is_fisheye = self.all.get("camera_model"), self.all.get("is_fisheye") is True
         if model is None:
-            return "fisheye" if self._value("is_fisheye") is True else "perspective"
-        if model in PERSPECTIVE and self._value("is_fisheye") is not True:
+            return "fisheye" if is_fisheye else "perspective"
+        if model in PERSPECTIVE and not is_fisheye:
             return "perspective"
         if model in FISHEYE:
             return "fisheye"
@@ -225,10 +220,9 @@ class _Stated:
 
     def depth(self) -> DepthFile | None:
         """The depth of the frame."""
-        frame = self.scopes[0]
-        if "depth_file_path" not in frame:
+        if "depth_file_path" not in self.frame:
             return None
-        name = _take_name(frame, "depth_file_path", self.file, self.where)
+        name = _take_name(self.frame, "depth_file_path", self.file, self.where)
         step = self.number("depth_unit_scale_factor", DEPTH_STEP)
         if not step > 0:
             raise DataError(self.file, f"{self.where}: depth_unit_scale_factor must be positive; got {step:g}")

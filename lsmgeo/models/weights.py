@@ -313,12 +313,9 @@ def read_file(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
         CheckpointError: it is missing, no plain file, unreadable, or too large.
     """
     try:
-        # Reading up to a limit takes memory for all of it.
-        return read_bytes(path, min(limit, path.stat().st_size) if path.is_file() else limit)
+        return read_bytes(path, limit)
     except DataError as error:
         raise CheckpointError(path, error.reason) from error
-    except OSError as error:
-        raise CheckpointError(path, f"cannot be read ({error})") from error
 
 
 def fill_model(model: nn.Module, weights: Weights) -> None:

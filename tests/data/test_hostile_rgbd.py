@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lsmgeo import data
-from lsmgeo.data.pfm import read_pfm
+from lsmgeo.data.depth_files import read_pfm
 from lsmgeo.errors import DataError
 from tests.data.hostile import judged, mutated
 from tests.data.test_rgbd import write_rgbd, write_seven_scenes

@@ -1,4 +1,4 @@
-"""Damaging shards, and saying what became of reading them."""
+"""Damaging shards and scenes, and saying what became of reading them."""
 
 import io
 import tarfile
@@ -6,6 +6,7 @@ import tarfile
 import numpy as np
 import pytest
 
+from lsmgeo import data
 from lsmgeo.data import ShardSet
 from lsmgeo.errors import DataError
 
@@ -65,3 +66,41 @@ def judged(run):
     except Exception as error:
         return f"{type(error).__name__}: {error}"[:300]
     return "read"
+
+
+def read_scene(folder):
+    """A scene of which everything has been read, and is finite."""
+    scene = data.open(folder)
+    assert all(part.isfinite().all() for part in scene.cameras[:2])
+    for view in range(len(scene)):
+        scene.load(view)
+        depth = scene.load_depth(view)
+        assert depth is None or bool((depth.isfinite() & (depth >= 0)).all())
+    for observed in scene.points.observations if scene.points else ():
+        assert np.isfinite(observed.pixels).all()
+    return scene
+
+
+def scene_refused(folder, match=None, file=None):
+    """A scene is refused, by the name of a file of it and briefly."""
+    with pytest.raises(DataError, match=match) as caught:
+        read_scene(folder)
+    path = str(caught.value.path)
+    assert path.startswith(str(folder)) if file is None else path == str(folder / file)
+    assert path in str(caught.value)
+    assert len(str(caught.value)) < 2000
+
+
+def judge_mutations(folder, file, trials, run):
+    """Whatever is changed in a file, it is read or refused, and no file of the folder changes."""
+    rng = np.random.default_rng(0)
+    original = file.read_bytes()
+    before = sorted((str(path), path.stat().st_size) for path in folder.rglob("*"))
+    verdicts = []
+    for _ in range(trials):
+        file.write_bytes(mutated(rng, original))
+        verdicts.append(judged(run))
+    file.write_bytes(original)
+    assert set(verdicts) <= {"read", "refused"}
+    assert verdicts.count("refused") > trials // 20
+    assert sorted((str(path), path.stat().st_size) for path in folder.rglob("*")) == before

@@ -96,6 +96,6 @@ def test_mutated_pictures_are_refused_or_read(kind):
 
         return judged(run)
 
-    came = forked.outcomes(range(600), judge)
+    came = forked.outcomes(range(200), judge)
     assert set(came) == {"refused", "read"}
-    assert came.count("read") > 100
+    assert came.count("read") > 20

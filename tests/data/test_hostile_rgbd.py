@@ -8,32 +8,13 @@ import pytest
 
 from lsmgeo import data
 from lsmgeo.data.depth_files import read_pfm
-from lsmgeo.errors import DataError
-from tests.data.hostile import judged, mutated
+from tests.data.hostile import judge_mutations, read_scene, scene_refused
 from tests.data.test_rgbd import write_rgbd, write_seven_scenes
 from tests.data.test_stereo_pairs import HEIGHT, WIDTH, write_pair
 from tests.data.writers import make_scene
 
 SCENE = make_scene(24, 32)
 pytestmark = pytest.mark.timeout(60)
-
-
-def read_all(folder):
-    scene = data.open(folder)
-    assert scene.cameras.cam_from_world.isfinite().all()
-    assert scene.cameras.intrinsics.isfinite().all()
-    for view in range(len(scene)):
-        scene.load(view)
-        depth = scene.load_depth(view)
-        assert depth is None or bool((depth.isfinite() & (depth >= 0)).all())
-
-
-def refused(folder, match, file=None):
-    with pytest.raises(DataError, match=match) as caught:
-        read_all(folder)
-    assert str(caught.value.path) in str(caught.value)
-    if file is not None:
-        assert str(caught.value.path) == str(folder / file)
 
 
 def replace_line(file, number, line):
@@ -63,11 +44,11 @@ def replace_line(file, number, line):
 def test_poses_are_checked(tmp_path, line, match):
     folder = write_rgbd(SCENE, tmp_path / "table", absent=0)
     replace_line(folder / "poses.txt", 1, line)
-    refused(folder, match, "poses.txt")
+    scene_refused(folder, match, "poses.txt")
     if line:
         folder = write_seven_scenes(SCENE, tmp_path / "files")
         (folder / "frame-000001.pose.txt").write_text(line)
-        refused(folder, match)
+        scene_refused(folder, match)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +59,7 @@ def test_poses_are_checked(tmp_path, line, match):
 def test_names_of_frames_are_checked(tmp_path, name, match):
     folder = write_rgbd(SCENE, tmp_path / "table", absent=0)
     replace_line(folder / "frame_index.txt", 1, name)
-    refused(folder, match, "frame_index.txt")
+    scene_refused(folder, match, "frame_index.txt")
 
 
 @pytest.mark.parametrize(
@@ -90,7 +71,7 @@ def test_names_of_frames_are_checked(tmp_path, name, match):
 def test_intrinsics_are_checked(tmp_path, content, match):
     folder = write_rgbd(SCENE, tmp_path / "table", absent=0)
     (folder / "K.txt").write_text(content)
-    refused(folder, match, "K.txt")
+    scene_refused(folder, match, "K.txt")
 
 
 @pytest.mark.parametrize("form", ["table", "files", "pair"])
@@ -110,17 +91,17 @@ def test_links_out_of_the_folder_are_refused(tmp_path, form):
         outside.write_bytes(content)
         file.unlink()
         file.symlink_to(outside)
-        refused(folder, "outside its folder")
+        scene_refused(folder, "outside its folder")
         file.unlink()
         file.write_bytes(content)
-    read_all(folder)
+    read_scene(folder)
 
 
 def test_pipes_are_not_waited_for(tmp_path):
     folder = write_seven_scenes(SCENE, tmp_path / "scene")
     (folder / "frame-000001.pose.txt").unlink()
     os.mkfifo(folder / "frame-000001.pose.txt")
-    refused(folder, "no such file")
+    scene_refused(folder, "no such file")
 
 
 @pytest.mark.parametrize(
@@ -155,7 +136,7 @@ def test_calibrations_of_pairs_are_checked(tmp_path, old, new, match):
     text = (folder / "calib.txt").read_text()
     assert old in text
     (folder / "calib.txt").write_text(text.replace(old, new, 1))
-    refused(folder, match, "calib.txt")
+    scene_refused(folder, match, "calib.txt")
 
 
 BODY = np.ones((HEIGHT, WIDTH), "<f4").tobytes()
@@ -187,17 +168,13 @@ BODY = np.ones((HEIGHT, WIDTH), "<f4").tobytes()
 def test_float_maps_are_checked(tmp_path, content, match):
     folder, _ = write_pair(tmp_path / "pair")
     (folder / "disp1.pfm").write_bytes(content)
-    refused(folder, match, "disp1.pfm")
-
-
-def files_of(folder):
-    return sorted((str(path), path.stat().st_size) for path in folder.rglob("*"))
+    scene_refused(folder, match, "disp1.pfm")
 
 
 @pytest.mark.parametrize("file", ["poses.txt", "frame_index.txt", "K.txt"])
 def test_damaged_tables_give_a_data_error_or_a_scene(tmp_path, file):
     folder = write_rgbd(SCENE, tmp_path / "scene", absent=0)
-    judge_mutations(folder, folder / file, 700, lambda: data.open(folder))
+    judge_mutations(folder, folder / file, 100, lambda: data.open(folder))
 
 
 @pytest.mark.parametrize("file", ["calib.txt", "frame-000002.pose.txt"])
@@ -206,25 +183,11 @@ def test_damaged_cameras_give_a_data_error_or_a_scene(tmp_path, file):
         folder, _ = write_pair(tmp_path / "scene")
     else:
         folder = write_seven_scenes(SCENE, tmp_path / "scene")
-    judge_mutations(folder, folder / file, 2000, lambda: data.open(folder))
+    judge_mutations(folder, folder / file, 100, lambda: data.open(folder))
 
 
 def test_damaged_float_maps_give_a_data_error_or_a_map(tmp_path):
     file = tmp_path / "a.pfm"
     # Short, so that most mutations meet the header.
     file.write_bytes(b"Pf\n3 2\n-1\n" + struct.pack("<6f", *range(6)))
-    judge_mutations(tmp_path, file, 2000, lambda: read_pfm(file, (2, 3)))
-
-
-def judge_mutations(folder, file, trials, run):
-    rng = np.random.default_rng(0)
-    original = file.read_bytes()
-    before = files_of(folder)
-    verdicts = []
-    for _ in range(trials):
-        file.write_bytes(mutated(rng, original))
-        verdicts.append(judged(run))
-    file.write_bytes(original)
-    assert set(verdicts) <= {"read", "refused"}
-    assert verdicts.count("refused") > trials // 20
-    assert files_of(folder) == before
+    judge_mutations(tmp_path, file, 100, lambda: read_pfm(file, (2, 3)))

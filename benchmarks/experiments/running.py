@@ -27,7 +27,7 @@ from lsmgeo.models.evaluation.shapes import SizedShapes, batches
 from lsmgeo.models.training.checkpoints import load_latest
 from lsmgeo.models.training.evaluating import evaluate_model
 from lsmgeo.models.training.feeding import Need, open_shapes, validation_batches
-from lsmgeo.models.training.signals import StopRequest
+from lsmgeo.models.training.launch import StopRequest
 from lsmgeo.models.weights import read_weights, write_weights
 
 __all__ = ["EVALUATION", "WEIGHTS", "Folder", "hash_shapes", "run_experiment"]

@@ -292,13 +292,10 @@ def read_config(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> 
     text = read_text(path, MAX_BYTES)
     try:
         values = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-        if not isinstance(values, Mapping):
-            raise OptionError(f"a configuration must be a table of groups; got {describe(values)}")
-        config = None if overrides else make_config(values)
+        if not overrides or not isinstance(values, Mapping):
+            return make_config(values)
     except (ValueError, RecursionError) as error:  # OptionError is one
         raise DataError(path, str(error)) from error
-    if config is not None:
-        return config
     changed = {group: dict(content) if isinstance(content, Mapping) else content for group, content in values.items()}
     for override in overrides:
         key, equals, text = override.partition("=")

@@ -15,9 +15,8 @@ from lsmgeo.data import Batch, Sample
 from lsmgeo.metrics import DepthError, VoxelIoU
 from lsmgeo.models.losses import sum_loss
 from lsmgeo.models.model import evaluating
+from lsmgeo.models.training.launch import StopRequest, any_true, gather
 from lsmgeo.models.training.pictures import Example
-from lsmgeo.models.training.processes import any_true, gather
-from lsmgeo.models.training.signals import StopRequest
 
 __all__ = ["Evaluation", "evaluate_model"]
 

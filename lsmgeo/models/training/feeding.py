@@ -23,7 +23,7 @@ from lsmgeo.data import Batch, EpochSampler, ShapeDataset, ShardSet, collate
 from lsmgeo.errors import OptionError
 from lsmgeo.models.training.adapting import AdaptedShapes
 from lsmgeo.models.training.config import DataConfig
-from lsmgeo.models.training.signals import ignore_stop
+from lsmgeo.models.training.launch import ignore_stop
 from lsmgeo.models.training.synthetic_shapes import Renderer, SyntheticShapes
 
 __all__ = ["Need", "ShapeStream", "Shapes", "open_shapes", "training_batches", "validation_batches"]

@@ -12,7 +12,6 @@ import time
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ import numpy.typing as npt
 from lsmgeo.data.files import write_atomic
 from lsmgeo.data.images import encode_png
 from lsmgeo.errors import DataError
+from lsmgeo.models.training.config import RunConfig
 from lsmgeo.models.training.evaluating import Evaluation
 from lsmgeo.models.training.pictures import draw_examples
 
@@ -37,40 +37,34 @@ class RunLog:
 
     Args:
         folder: the run's folder.
+        run: says where it ends, and whether to write for TensorBoard.
         step: where the run begins or goes on; what TensorBoard shows from later steps is replaced.
-        steps: where it ends, if that is known.
         is_writer: whether this process writes.
-        tensorboard: whether to write for TensorBoard.
         quiet: whether to show no progress.
     """
 
     def __init__(
         self,
         folder: Path,
+        run: RunConfig,
         *,
         step: int,
-        steps: int | None,
         is_writer: bool = True,
-        tensorboard: bool = True,
         quiet: bool = False,
     ) -> None:
         self.folder, self.is_writer = folder, is_writer
         self._warned: set[str] = set()
         self._shown = time.monotonic()
-        self._board = self._open_board(step) if is_writer and tensorboard else None
+        self._board = self._open_board(step) if is_writer and run.tensorboard else None
         self._bar: Any = None
         self._prints = is_writer and not quiet
         if self._prints and sys.stderr.isatty():
             from tqdm import tqdm
 
-            self._bar = tqdm(total=steps, initial=step, unit="step", dynamic_ncols=True, smoothing=0.05)
+            self._bar = tqdm(total=run.steps, initial=step, unit="step", dynamic_ncols=True, smoothing=0.05)
 
-    def __enter__(self) -> RunLog:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """Write what is left."""
         if self._bar is not None:
             self._bar.close()
         if self._board is not None:

@@ -20,6 +20,17 @@ from lsmgeo.models.training.checkpoints import Checkpoint, check_config, load_la
 from lsmgeo.models.training.config import TrainingConfig
 from lsmgeo.models.training.evaluating import Evaluation, evaluate_model
 from lsmgeo.models.training.feeding import Need, open_shapes, training_batches, validation_batches
+from lsmgeo.models.training.launch import (
+    StopRequest,
+    any_true,
+    catch_stop,
+    check_agreement,
+    decided,
+    gather,
+    hold_folder,
+    make_model,
+    started,
+)
 from lsmgeo.models.training.logs import RunLog
 from lsmgeo.models.training.optimising import (
     TIMED_STEPS,
@@ -30,9 +41,6 @@ from lsmgeo.models.training.optimising import (
     make_optimiser,
     move_parameters,
 )
-from lsmgeo.models.training.processes import any_true, check_agreement, gather
-from lsmgeo.models.training.signals import StopRequest, catch_stop
-from lsmgeo.models.training.starting import decided, hold_folder, make_model, started
 from lsmgeo.models.weights import CHECKPOINTS, checksum, fill_model, step_folder, tensors_of
 
 if TYPE_CHECKING:
@@ -166,16 +174,9 @@ def _train(
 
     wrapped = accelerator.prepare_model(model)
     taken_a_step = run.batch * run.accumulation * processes
-    batches = training_batches(
-        shapes,
-        seed=run.seed,
-        start=place.step * taken_a_step,
-        batch=run.batch,
-        workers=data.workers,
-        device=device,
-        rank=rank,
-        processes=processes,
-    )
+    loading: dict[str, Any] = {"seed": run.seed, "batch": run.batch, "device": device}
+    loading |= {"rank": rank, "processes": processes}
+    batches = training_batches(shapes, start=place.step * taken_a_step, workers=data.workers, **loading)
     # About how many terms the loss of a batch has.
     terms = run.batch * (need.voxels**3 if need.voxels else most * need.image_size**2)
     saved = None if checkpoint is None else checkpoint.path
@@ -191,12 +192,10 @@ def _train(
     def save(*, must: bool) -> None:
         nonlocal saved, saved_step
         place.seconds, place.cpu_seconds = time.monotonic() - begin, time.process_time() - cpu_begin
-        epoch, position = divmod(place.step * taken_a_step, len(shapes))
         state = {
             "optimiser": optimiser.state_dict(),
             "guard": guard.state_dict(),
             "scaler": None if accelerator.scaler is None else accelerator.scaler.state_dict(),
-            "sampler": {"epoch": epoch, "position": position, "seed": run.seed},
             "place": asdict(place),
         }
         reason = None
@@ -226,18 +225,8 @@ def _train(
             warnings.warn(f"{reason}; the run goes on without this checkpoint", stacklevel=3)
 
     def measure(shapes: int, pictures: int) -> Evaluation | None:
-        with contextlib.closing(
-            validation_batches(
-                held_back,
-                seed=run.seed,
-                count=shapes,
-                batch=run.batch,
-                device=device,
-                workers=min(1, data.workers),
-                rank=rank,
-                processes=processes,
-            )
-        ) as some:
+        workers = min(1, data.workers)
+        with contextlib.closing(validation_batches(held_back, count=shapes, workers=workers, **loading)) as some:
             return evaluate_model(model, some, stop, region=run.region, loss=run.loss, pictures=pictures)
 
     def planned() -> int | None:
@@ -262,9 +251,7 @@ def _train(
     # signals with which Python ends its children.
     with (
         hold_folder(folder) if rank == 0 else contextlib.nullcontext(),
-        RunLog(
-            folder, step=place.step, steps=run.steps, is_writer=rank == 0, tensorboard=run.tensorboard, quiet=quiet
-        ) as log,
+        contextlib.closing(RunLog(folder, run, step=place.step, is_writer=rank == 0, quiet=quiet)) as log,
         contextlib.closing(batches),
     ):
         if rank == 0:

@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from lsmgeo.errors import CheckpointError, TrainingError
-from lsmgeo.models.training import TrainingConfig, loop, optimising
+from lsmgeo.models.training import RunConfig, TrainingConfig, loop, optimising
 from lsmgeo.models.training import logs as log_module
 from tests.models.training.faults import Points, fill, in_child, in_processes, kill, leftovers
 from tests.models.training.runs import assert_same_end, configure, end_of, events, losses, run, write_shapes
@@ -367,7 +367,7 @@ def test_lines_of_the_log_are_whole_on_a_disk_with_room_for_half_a_line(tmp_path
     path.write_bytes(before)
 
     def work() -> None:
-        log = log_module.RunLog(tmp_path, step=0, steps=None, tensorboard=False, quiet=True)
+        log = log_module.RunLog(tmp_path, RunConfig(steps=1, tensorboard=False), step=0, quiet=True)
         log.event("first", value=1)
         limit(path.stat().st_size + 10)
         with pytest.warns(UserWarning, match=r"log.jsonl: cannot be written"):

@@ -27,9 +27,9 @@ from lsmgeo.models.training import (
     OptimiserConfig,
     RunConfig,
     TrainingConfig,
+    launch,
     optimising,
     read_config,
-    starting,
 )
 from lsmgeo.models.training.checkpoints import load_latest
 from lsmgeo.models.training.feeding import Need, open_shapes, training_batches, validation_batches
@@ -156,7 +156,7 @@ def test_what_a_run_leaves(shards, tmp_path):
     trained = run(config, tmp_path)
     assert (trained.step, trained.ended, trained.exit_code, trained.is_first) == (2, "steps", 0, True)
     assert trained.checkpoint == tmp_path / "checkpoints" / "step_00000002"
-    expected = starting.decided(config, None)
+    expected = launch.decided(config, None)
     assert read_config(tmp_path / "config.json").to_dict() == expected.to_dict()
     assert [line["event"] for line in events(tmp_path)] == [
         *("start", "checkpoint", "step", "step", "evaluation", "checkpoint", "stop"),
@@ -289,7 +289,7 @@ def test_two_runs_do_not_share_a_folder(shards, tmp_path):
     ready, wait = os.pipe(), os.pipe()
 
     def hold():
-        with starting.hold_folder(tmp_path):
+        with launch.hold_folder(tmp_path):
             os.write(ready[1], b"1")
             os.read(wait[0], 1)
 
@@ -355,14 +355,14 @@ def test_what_is_left_to_the_trainer_is_decided_once(shards, tmp_path, monkeypat
     left = configure(shards, precision="auto")
     for has_amx, expected in ((False, "no"), (True, "bf16")):
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda has_amx=has_amx: {"amx_bf16": has_amx})
-        decided = starting.decided(left, None)
+        decided = launch.decided(left, None)
         assert (decided.run.precision, decided.run.channels_last) == (expected, False)
     run(configure(shards, steps=1, precision="auto"), tmp_path / "run")
     assert read_config(tmp_path / "run" / "config.json").run.precision == "bf16"
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": False})
     assert run(configure(shards, steps=2, precision="auto"), tmp_path / "run").step == 2
     r2n2 = dataclasses.replace(left, model=ModelConfig(name="r2n2", preset="tiny"))
-    assert starting.decided(r2n2, None).run.channels_last is True
+    assert launch.decided(r2n2, None).run.channels_last is True
 
 
 def test_weights_say_what_they_reached(shards, tmp_path):

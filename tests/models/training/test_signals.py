@@ -13,8 +13,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from lsmgeo.errors import TrainingError
-from lsmgeo.models.training.processes import any_true, check_agreement, gather
-from lsmgeo.models.training.signals import catch_stop, ignore_stop
+from lsmgeo.models.training.launch import any_true, catch_stop, check_agreement, gather, ignore_stop
 from tests.models.training.faults import in_child, in_processes
 
 

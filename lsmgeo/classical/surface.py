@@ -194,17 +194,11 @@ def _without_unused(mesh: Mesh, faces: np.ndarray) -> Mesh:
 
 def _colours_at(colours: Tensor, index: np.ndarray) -> np.ndarray:
     """Colours at fractional indices (N, 3), from the corners that have any: (N, 3) uint8."""
-    values = colours.detach().cpu().float().numpy()
-    known = (values.max(0) > 0).astype(np.float32)
-    size = np.array(values.shape[:0:-1])
-    low = np.clip(np.floor(index).astype(np.int64), 0, np.maximum(size - 2, 0))
-    part = index - low
-    total, weight = np.zeros((len(index), 3)), np.zeros(len(index))
-    for corner in np.ndindex(2, 2, 2):
-        share = np.where(corner, part, 1 - part).prod(1)
-        x, y, z = np.minimum(low + corner, size - 1).T
-        share = share * known[z, y, x]
-        total += share[:, None] * values[:, z, y, x].T
-        weight += share
-    mean = total / np.maximum(weight, 1e-12)[:, None]
+    from scipy.ndimage import map_coordinates
+
+    values = colours.detach().cpu().double().numpy()
+    known = (values.max(0) > 0).astype(np.float64)
+    at = index.T[::-1]
+    sums = [map_coordinates(part, at, order=1, mode="nearest") for part in (*values * known, known)]
+    mean = np.stack(sums[:3], 1) / np.maximum(sums[3], 1e-12)[:, None]
     return (np.clip(mean, 0, 1) * 255).round().astype(np.uint8)

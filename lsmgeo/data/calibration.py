@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 __all__ = ["Board", "CalibratedLens", "Calibration", "Rig", "calibration_files", "is_calibration", "read_calibration"]
-
-Value = TypeVar("Value")
 
 MOST_FILES = 64
 # A calibration with the corners of a hundred boards in it has one tenth of this.
@@ -66,7 +64,7 @@ class CalibratedLens:
 
 
 class Entries(NamedTuple):
-    """What one file states, by name."""
+    """What one file states, by name without underscores and capitals."""
 
     numbers: dict[str, float]
     texts: dict[str, tuple[str, ...]]
@@ -162,20 +160,19 @@ def read_calibration(path: str | Path) -> Calibration:
     for file, entries in zip(files, read_storages(files), strict=True):
         if isinstance(entries, DataError):
             raise entries
-        folded = _folded(entries, file)
-        for name, lens in _lenses(folded, file):
+        for name, lens in _lenses(entries, file):
             if name in lenses:
                 raise DataError(file, f"states the lens {name!r}, and so does {lenses[name].file.name}; name one file")
             lenses[name] = lens
-        if (found := _rig(folded, file)) is not None:
+        if (found := _rig(entries, file)) is not None:
             if rig is not None:
                 raise DataError(file, f"states R and T, and so does {rig.file.name}; name one file")
             rig = found
-        if (seen := _board(folded, file)) is not None:
+        if (seen := _board(entries, file)) is not None:
             if board is not None and board.corners != seen.corners:
                 raise DataError(file, f"states a board of {seen.corners} corners, another file {board.corners}")
             board = seen
-        lists += [(file, names) for names in folded.texts.values() if _are_pictures(names)]
+        lists += [(file, names) for names in entries.texts.values() if _are_pictures(names)]
     if len(lists) > 1:
         raise DataError(lists[1][0], f"lists pictures, and so does {lists[0][0].name}; name one file")
     pictures = _pictures(*lists[0]) if lists else ()
@@ -196,30 +193,22 @@ def read_storages(paths: Sequence[Path]) -> list[Entries | DataError]:
         if isinstance(arrays, DataError):
             results.append(arrays)
             continue
-        numbers = {name: array for name, array in arrays.items() if array.dtype == np.float64 and array.ndim in (0, 2)}
+        folded = {name.replace("_", "").lower(): array for name, array in arrays.items()}
+        numbers = {name: array for name, array in folded.items() if array.dtype == np.float64 and array.ndim in (0, 2)}
         wrong = [name for name, array in numbers.items() if not (np.abs(array) <= BEYOND).all()]
-        if wrong:
+        if len(folded) != len(arrays):
+            reason = "states two values whose names differ in capitals or underscores alone"
+            results.append(DataError(path, reason))
+        elif wrong:
             reason = f"{wrong[0][:80]!r} must hold finite numbers of at most {BEYOND:g}"
             results.append(DataError(path, reason))
-            continue
-        results.append(Entries(
-            {name: float(array) for name, array in numbers.items() if array.ndim == 0},
-            {name: tuple(array.ravel().tolist()) for name, array in arrays.items() if array.dtype.kind == "U"},
-            {name: array for name, array in numbers.items() if array.ndim == 2},
-        ))  # fmt: skip
+        else:
+            results.append(Entries(
+                {name: float(array) for name, array in numbers.items() if array.ndim == 0},
+                {name: tuple(array.ravel().tolist()) for name, array in folded.items() if array.dtype.kind == "U"},
+                {name: array for name, array in numbers.items() if array.ndim == 2},
+            ))  # fmt: skip
     return results
-
-
-def _folded(entries: Entries, file: Path) -> Entries:
-    """The entries under names without underscores and capitals."""
-
-    def fold(part: dict[str, Value]) -> dict[str, Value]:
-        folded = {name.replace("_", "").lower(): value for name, value in part.items()}
-        if len(folded) != len(part):
-            raise DataError(file, "states two values whose names differ in capitals or underscores alone")
-        return folded
-
-    return Entries(fold(entries.numbers), fold(entries.texts), fold(entries.matrices))
 
 
 def _lenses(entries: Entries, file: Path) -> Iterator[tuple[str, CalibratedLens]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from lsmgeo.data.scan_conversion import LINES, Line, cells_touched, crossing_cou
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid
 
-__all__ = ["Plan", "plan_voxels", "voxelise"]
+__all__ = ["plan_voxels", "voxelise"]
 
 LARGEST_RESOLUTION = 512
 AXES = LINES[:3]
@@ -26,20 +25,7 @@ MOST_HOLLOWS = 64
 Shape = tuple[int, int, int]
 
 
-class Plan(NamedTuple):
-    """How `voxelise` treats the faces of a mesh, each (K, 3) by vertex number.
-
-    Attributes:
-        closed: closed parts, faces turned to agree and outwards; the winding number decides.
-        unoriented: closed parts whose faces cannot be made to agree, as some edges have more than two; parity decides.
-        sheets: parts with holes; thirteen directions vote on the winding number.
-        unoriented_sheets: parts with holes whose faces do not agree either; the vote is on parity.
-    """
-
-    closed: np.ndarray
-    unoriented: np.ndarray
-    sheets: np.ndarray
-    unoriented_sheets: np.ndarray
+Group = tuple[np.ndarray, Sequence[Line], bool]
 
 
 def voxelise(
@@ -105,29 +91,27 @@ def voxelise(
     low, high = (np.array(bound, np.float64) for bound in (grid.lower, grid.upper))
     count = (width, height, depth)
     points = (mesh.vertices - low) / (high - low) * count - 0.5  # centres are whole numbers
-    solid = _solid_of_parts(points, plan_voxels(mesh), count)
+    solid = np.zeros(count, bool)
+    for faces, lines, signed in plan_voxels(mesh):
+        if len(faces):
+            solid |= _by_vote(points[faces], count, lines, signed=signed)
     if keep_thin:
         solid = _with_thin(solid, cells_touched(points[mesh.faces], count))
     return torch.from_numpy(np.ascontiguousarray(solid.transpose(2, 1, 0)))
 
 
-def plan_voxels(mesh: Mesh) -> Plan:
-    """How ``voxelise(mesh)`` will treat each part of a mesh.
+def plan_voxels(mesh: Mesh) -> tuple[Group, ...]:
+    """Four groups of faces (K, 3), the lines that vote on each, and whether on the winding number, else on parity.
 
-    Example:
-        >>> import numpy as np
-        >>> from lsmgeo.data.meshes import Mesh
-        >>> from lsmgeo.data.voxelise import plan_voxels
-        >>> sheet = Mesh(np.eye(3), np.array([[0, 1, 2]]))
-        >>> [len(faces) for faces in plan_voxels(sheet)]
-        [0, 0, 1, 0]
+    Closed parts, their faces turned to agree and outwards; closed parts whose faces cannot be made to agree, as some
+    edges have more than two; parts with holes; parts with holes whose faces do not agree either.
     """
     faces = mesh.faces
     merged = merged_faces(mesh.vertices, faces)
     real = are_real(merged)
     merged, faces = merged[real], faces[real]
     if len(faces) == 0:
-        return Plan(faces, faces, faces, faces)
+        return ()
     parts = parts_of(merged)
     if parts.doubled.any():
         twice = parts.doubled[parts.part]
@@ -141,8 +125,11 @@ def plan_voxels(mesh: Mesh) -> Plan:
         parts = parts_of(merged)
     closed, oriented = parts.closed[parts.part], parts.oriented[parts.part]
     outward = _outward(mesh.vertices, faces, parts)
-    return Plan(
-        outward[closed & oriented], faces[closed & ~oriented], faces[~closed & oriented], faces[~closed & ~oriented]
+    return (
+        (outward[closed & oriented], AXES, True),
+        (faces[closed & ~oriented], AXES, False),
+        (faces[~closed & oriented], LINES, True),
+        (faces[~closed & ~oriented], LINES, False),
     )
 
 
@@ -183,19 +170,6 @@ def winding_number(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         below = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
         result[index] = np.arctan2(above, below).sum() / (2 * np.pi)
     return result
-
-
-def _solid_of_parts(points: np.ndarray, plan: Plan, count: Shape) -> np.ndarray:
-    solid = np.zeros(count, bool)
-    for faces, lines, signed in (
-        (plan.closed, AXES, True),
-        (plan.unoriented, AXES, False),
-        (plan.sheets, LINES, True),
-        (plan.unoriented_sheets, LINES, False),
-    ):
-        if len(faces):
-            solid |= _by_vote(points[faces], count, lines, signed=signed)
-    return solid
 
 
 def _by_vote(triangles: np.ndarray, count: Shape, lines: Sequence[Line], *, signed: bool) -> np.ndarray:

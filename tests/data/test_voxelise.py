@@ -257,7 +257,7 @@ def test_parts_and_plans():
     parts = parts_of(merged_faces(two.vertices, faces[1:]))
     assert sorted(parts.closed.tolist()) == [False, True]
     holed = Mesh(np.asarray(two.vertices), faces[1:])
-    assert [len(group) for group in plan_voxels(holed)] == [12, 0, 11, 0]
+    assert [len(group[0]) for group in plan_voxels(holed)] == [12, 0, 11, 0]
     # Three sheets at one edge: closed never, and no turning makes them agree.
     fan = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]])
     points = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [-1, 0, 1], [-1, 0, -1]], float)

@@ -17,7 +17,7 @@ from lsmgeo.data.lsm_release import read_lsm
 from lsmgeo.data.members import encode_sample
 from lsmgeo.data.mesh_rendering import render_mesh
 from lsmgeo.data.meshes import Mesh, from_trimesh, load_mesh, normalise
-from lsmgeo.data.middlebury import read_middlebury
+from lsmgeo.data.middlebury import Disparity, read_middlebury, read_stereo_pair
 from lsmgeo.data.posed import Observations, PosedImages, SparsePoints, Voxels
 from lsmgeo.data.r2n2 import read_r2n2
 from lsmgeo.data.render_set import Made, render_set
@@ -26,7 +26,6 @@ from lsmgeo.data.scene_writers import write_cameras_json, write_colmap, write_tr
 from lsmgeo.data.shard_reading import ShardSet
 from lsmgeo.data.shards import hash_settings, verify_shard, write_shard
 from lsmgeo.data.sources import Recipe
-from lsmgeo.data.stereo_pairs import Disparity, read_stereo_pair
 from lsmgeo.data.strecha import read_strecha
 from lsmgeo.data.transforms_json import read_transforms
 from lsmgeo.data.voxelise import voxelise

@@ -15,10 +15,9 @@ from lsmgeo.data.files import refuse_unreadable
 from lsmgeo.data.images import SUFFIXES
 from lsmgeo.data.llff import is_llff, read_llff
 from lsmgeo.data.lsm_release import is_lsm, read_lsm
-from lsmgeo.data.middlebury import is_middlebury, read_middlebury
+from lsmgeo.data.middlebury import is_middlebury, is_stereo_pair, read_middlebury, read_stereo_pair
 from lsmgeo.data.posed import PosedImages
 from lsmgeo.data.r2n2 import is_r2n2, read_r2n2
-from lsmgeo.data.stereo_pairs import is_stereo_pair, read_stereo_pair
 from lsmgeo.data.strecha import is_strecha, read_strecha
 from lsmgeo.data.transforms_json import is_transforms, read_transforms
 from lsmgeo.errors import DataError

@@ -102,31 +102,20 @@ def test_a_point_cloud_reads_back_and_leaves_nothing_else(tmp_path):
     assert [file.name for file in path.parent.iterdir()] == ["points.ply"]
 
 
-def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
-    path = data.write_atomic(tmp_path / "result", b"old")
-
-    def full(descriptor):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(DataError, match="No space left"):
-        data.write_atomic(path, b"new and longer")
-    assert path.read_bytes() == b"old"
-    assert [file.name for file in tmp_path.iterdir()] == ["result"]
-
-
 @pytest.mark.parametrize("step", ["os.open", "os.write", "os.fsync", "pathlib.Path.replace"])
-def test_an_interrupted_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch, step):
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch, step, error):
+    def fail(*_, **__):
+        raise error
+
     path = data.write_atomic(tmp_path / "result", b"old")
-    monkeypatch.setattr(step, interrupt)
-    with pytest.raises(KeyboardInterrupt):
+    monkeypatch.setattr(step, fail)
+    expected = "No space left" if isinstance(error, OSError) else None
+    with pytest.raises(DataError if expected else KeyboardInterrupt, match=expected):
         data.write_atomic(path, b"new and longer")
+    monkeypatch.undo()
     assert path.read_bytes() == b"old"
     assert [file.name for file in tmp_path.iterdir()] == ["result"]
-
-
-def interrupt(*_, **__):
-    raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize(

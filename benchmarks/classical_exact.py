@@ -12,28 +12,15 @@ from scipy.spatial import cKDTree
 
 from benchmarks.classical_rivals import row
 from lsmgeo import VoxelGrid, scenes
-from lsmgeo.cameras import CameraTensors, orbit, select, stack
-from lsmgeo.classical import extract_mesh, fuse_depth, sweep, sweep_planes, visual_hull
+from lsmgeo.cameras import orbit, select, stack
+from lsmgeo.classical import extract_mesh, fuse_depth, visual_hull
 from lsmgeo.metrics import VoxelIoU
 from lsmgeo.scenes import synthetic13
 from tests.classical import analytic as traced
+from tests.classical.scored import median_error, swept, to_box, to_ellipsoid, within_one_plane
+from tests.classical.seen import is_closed
 
 Rows = list[dict[str, Any]]
-
-
-def errors(surface: str, planes: int = 64, seed: int = 0) -> tuple[float, float, float]:
-    """Percentage within one plane, and median relative depth errors: refined, and at the winning plane."""
-    pictures = traced.render(surface, seed=seed)
-    cameras = CameraTensors(torch.from_numpy(pictures.K), torch.from_numpy(pictures.E), *pictures.depth.shape)
-    depths = sweep_planes(cameras, traced.NEAR, traced.FAR, planes)
-    found = sweep(torch.from_numpy(pictures.images), cameras, depths)
-    true = pictures.depth[pictures.mask]
-    winner = found.planes.round().numpy()[pictures.mask]
-    ideal = np.interp(-1 / true, -1 / depths.numpy(), np.arange(planes))
-    within = 100 * float((np.abs(winner - ideal) <= 1).mean())
-    estimates = found.depth.numpy()[pictures.mask], depths.numpy()[winner.clip(0).astype(int)]
-    refined, plain = (float(np.median(np.abs(depth - true) / true)) for depth in estimates)
-    return within, refined, plain
 
 
 def analytic() -> Rows:
@@ -45,17 +32,24 @@ def analytic() -> Rows:
     """
     rows = []
     for surface in (*traced.SURFACES, "corner"):
-        measured = [errors(surface, seed=seed) for seed in (0, 1)]
-        within, median = min(values[0] for values in measured), max(values[1] for values in measured)
+        measured = []
+        for seed in (0, 1):
+            pictures = traced.render(surface, seed=seed)
+            depths, found = swept(pictures)
+            share = 100 * within_one_plane(pictures, depths, found)
+            measured.append((share, -median_error(pictures, found.depth.numpy())))
+        within, median = (min(values) for values in zip(*measured, strict=True))
         least = 98.0 if surface == "box" else 99.5
-        goals = f"at least {least:g} %", "at most 1e-03"
         # Of a corner all faces are steep: windows that face the camera lie on none of them.
-        goals = ("", "") if surface == "corner" else goals
+        goals = ("", "") if surface == "corner" else (f"at least {least:g} %", "at most 1e-03")
         name = f"analytic {surface}"
         rows.append(row(name, "pixels within one of 64 planes", f"{within:.2f} %", goals[0], within >= least))
-        rows.append(row(name, "median relative error, refined", f"{median:.1e}", goals[1], median <= 1e-3))
+        rows.append(row(name, "median relative error, refined", f"{-median:.1e}", goals[1], -median <= 1e-3))
     for surface in ("slanted", "sphere"):
-        medians = [errors(surface, planes)[2] for planes in (16, 32, 64)]
+        pictures, medians = traced.render(surface), []
+        for planes in (16, 32, 64):
+            depths, found = swept(pictures, planes)
+            medians.append(median_error(pictures, depths[found.planes.round().numpy().clip(0).astype(int)]))
         ratios = [first / second for first, second in pairwise(medians)]
         what, text = (
             "unrefined error of 16 over 32, 32 over 64 planes",
@@ -106,23 +100,6 @@ RADII, HALF = np.array([0.42, 0.25, 0.33]), np.array([0.28, 0.2, 0.33])
 TURN = np.array([[0.8, -0.36, 0.48], [0.6, 0.48, -0.64], [0.0, 0.8, 0.6]])
 
 
-def to_ellipsoid(points: np.ndarray) -> np.ndarray:
-    """Distance to an ellipsoid about the origin: the root t of ``sum (a p / (a^2 + t))^2 = 1`` by bisection."""
-    p = np.abs(points)
-    low, high = np.full(len(p), -(RADII.min() ** 2)), RADII.max() * np.linalg.norm(p, axis=1) + 1e-9
-    for _ in range(60):
-        middle = (low + high) / 2
-        outside = ((RADII * p / (RADII**2 + middle[:, None])) ** 2).sum(1) > 1
-        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
-    return np.linalg.norm(p - RADII**2 * p / (RADII**2 + high[:, None]), axis=1)
-
-
-def to_box(points: np.ndarray) -> np.ndarray:
-    """Distance to the surface of a box about the origin."""
-    beyond = np.abs(points) - HALF
-    return np.abs(np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(1), 0))
-
-
 def solids() -> list[tuple[str, scenes.Solid, Callable[[np.ndarray], np.ndarray], np.ndarray, float]]:
     """Name, solid, the distance of points to its surface, points on it, and the share to be within half a voxel."""
     generator = np.random.default_rng(6)
@@ -135,17 +112,15 @@ def solids() -> list[tuple[str, scenes.Solid, Callable[[np.ndarray], np.ndarray]
     ball, egg = scenes.sphere((0, 0, 0), 0.4), scenes.ellipsoid((0, 0, 0), tuple(RADII))
     box, turn = scenes.box((0, 0, 0), tuple(2 * HALF)), np.c_[TURN, np.zeros(3)]
     return [
-        ("sphere", ball, lambda points: np.abs(np.linalg.norm(points, axis=1) - 0.4), 0.4 * globe, 0.99),
-        ("ellipsoid", egg.transformed(turn), lambda p: to_ellipsoid(p @ TURN), (globe * RADII) @ TURN.T, 0.99),
-        ("box along the grid", box, to_box, sides, 0.95),
-        ("box, turned", box.transformed(turn), lambda points: to_box(points @ TURN), sides @ TURN.T, 0.95),
+        ("sphere", ball, lambda points: np.linalg.norm(points, axis=1) - 0.4, 0.4 * globe, 0.99),
+        ("ellipsoid", egg.transformed(turn), lambda p: to_ellipsoid(p @ TURN, RADII), (globe * RADII) @ TURN.T, 0.99),
+        ("box along the grid", box, lambda points: to_box(points, HALF), sides, 0.95),
+        ("box, turned", box.transformed(turn), lambda points: to_box(points @ TURN, HALF), sides @ TURN.T, 0.95),
     ]
 
 
 def tsdf() -> Rows:
     """How true surfaces fused from exact depth are, of cameras evenly spread over a sphere (the golden spiral)."""
-    import trimesh
-
     turn = torch.arange(VIEWS, dtype=torch.float64)[None] + 0.5
     azimuth, elevation = torch.rad2deg(np.pi * (3 - 5**0.5) * turn), torch.rad2deg(torch.asin(1 - 2 * turn / VIEWS))
     cameras = orbit(azimuth, elevation, 2.0, focal_length=1.875 * SIZE, height=SIZE, width=SIZE)
@@ -157,7 +132,7 @@ def tsdf() -> Rows:
         mesh = extract_mesh(fuse_depth(pictures.depth[0], select(cameras, 0, 0), grid), grid)
         points = np.einsum("sk,mkc->msc", shares, mesh.vertices.astype(np.float64)[mesh.faces]).reshape(-1, 3)
         # Of points of the true surface, to the nearest of the mesh's points: a little more than to the mesh.
-        away = {"mesh to solid": distance(points), "solid to mesh": cKDTree(points).query(surface)[0]}
+        away = {"mesh to solid": np.abs(distance(points)), "solid to mesh": cKDTree(points).query(surface)[0]}
         for kind, lengths in away.items():
             voxels = lengths * RESOLUTION
             share, median, most = (voxels <= 0.5).mean(), np.median(voxels), voxels.max()
@@ -165,7 +140,6 @@ def tsdf() -> Rows:
             measured = f"{100 * share:.2f} % within half a voxel, median {median:.3f}, most {most:.2f} voxels"
             goal = f">= {100 * least:.0f} % within half a voxel" + (", all within 1" if least > 0.95 else "")
             rows.append(row(section, what, measured, goal, share >= least and (most <= 1 or least <= 0.95)))
-        shell = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-        closed = shell.is_watertight and shell.is_winding_consistent
+        closed = is_closed(mesh.faces)
         rows.append(row(section, f"{name}: closed, {len(mesh.faces)} faces", "yes" if closed else "no", "yes", closed))
     return rows

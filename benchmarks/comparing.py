@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -179,18 +178,11 @@ def memory(problem: Problem, names: Iterable[str], settings: Settings, kind: str
     """
     found: dict[str, dict[str, Any]] = {}
     for name in taking_part(names, settings):
-        arguments = sized(problem, settings), name, kind
         try:
-            if not measuring.can_measure(settings.device):
-                raise LeftOut("this system tells no peak")
-            is_gpu = settings.device == "cuda"
-            found[name] = taken_by(*arguments) if is_gpu else measuring.alone(taken_by, *arguments)
+            arguments = sized(problem, settings), name, kind
+            found[name] = measuring.alone(taken_by, *arguments, device=settings.device)
         except LeftOut as reason:
             found[name] = {"left_out": str(reason)}
-        except MemoryError:
-            found[name] = {"left_out": "no memory"}
-        except multiprocessing.TimeoutError:
-            found[name] = {"left_out": "took too long, or ended early, most likely out of memory"}
     return found
 
 

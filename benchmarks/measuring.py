@@ -18,6 +18,8 @@ from typing import Any
 import torch
 from torch.utils.benchmark import timer
 
+from benchmarks.problems import LeftOut
+
 RESULTS = Path(__file__).parent / "results"
 FEWEST, MOST = 5, 31
 STATUS, REFERENCES = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -79,16 +81,14 @@ def rate(case: str, unit: str, rates: Iterable[float], target: float | None = No
     return {"case": case, "unit": unit, "rate": middle, "slowest": found[0], "fastest": found[-1], "target": target}
 
 
-def can_measure(device: str = "cpu") -> bool:
-    """Whether this system tells the peak of a process."""
-    return device == "cuda" or (STATUS.is_file() and os.access(REFERENCES, os.W_OK))
-
-
 def peak(run: Callable[[], Any], device: str = "cpu") -> int:
     """Bytes that a call takes at its peak above those in use before it.
 
     PyTorch counts on a GPU. Linux keeps the high-water mark of a process's resident memory (VmHWM) and sets it back on
     request.
+
+    Raises:
+        LeftOut: this system tells no peak.
     """
     run()  # pools, caches and code of the first call are not counted
     gc.collect()
@@ -99,6 +99,8 @@ def peak(run: Callable[[], Any], device: str = "cpu") -> int:
         run()
         torch.cuda.synchronize()
         return torch.cuda.max_memory_allocated() - before
+    if not os.access(REFERENCES, os.W_OK):
+        raise LeftOut("this system tells no peak")
     if platform.libc_ver()[0] == "glibc":
         ctypes.CDLL(None).malloc_trim(0)  # else freed blocks of the first call are used unseen
     before = _status("VmRSS")
@@ -117,16 +119,23 @@ def _answer(threads: int, function: Callable[..., Any], arguments: tuple[Any, ..
     return function(*arguments)
 
 
-def alone(function: Callable[..., Any], *arguments: Any, limit: float = 300.0) -> Any:
-    """What a function of a module answers in a process of its own, forked from one that has everything imported.
+def alone(function: Callable[..., Any], *arguments: Any, device: str = "cpu", limit: float = 300.0) -> Any:
+    """What a function of a module answers; on a CPU in a process of its own, forked from one that has imported all.
 
     Raises:
-        multiprocessing.TimeoutError: not within `limit` seconds, or it ended without an answer.
+        LeftOut: no memory, or no answer within `limit` seconds.
     """
+    if device == "cuda":
+        return function(*arguments)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["benchmarks.comparing"])
-    with context.Pool(1) as pool:
-        return pool.apply_async(_answer, (torch.get_num_threads(), function, arguments)).get(limit)
+    try:
+        with context.Pool(1) as pool:
+            return pool.apply_async(_answer, (torch.get_num_threads(), function, arguments)).get(limit)
+    except multiprocessing.TimeoutError:
+        raise LeftOut("took too long, or ended early, most likely out of memory") from None
+    except MemoryError:
+        raise LeftOut("no memory") from None
 
 
 def processor() -> str:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -23,6 +24,7 @@ from benchmarks import contenders as who
 from benchmarks import measuring, report, rivals
 from benchmarks.comparing import compare
 from benchmarks.measuring import Settings
+from benchmarks.problems import LeftOut
 from lsmgeo import models
 from lsmgeo.cameras import CameraTensors, orbit, to
 from lsmgeo.functional import Projected, Unprojected
@@ -162,9 +164,9 @@ def steps(settings: Settings) -> list[dict[str, Any]]:
             turns = {contender: work.step(contender, kind) for contender in work.models}
             seconds = measuring.interleaved(turns, settings.repeats, budget=60.0)
             taken: dict[str, int | None] = dict.fromkeys(work.models)
-            for contender in work.models if measuring.can_measure(settings.device) else ():
-                arguments = name, contender, kind, settings
-                taken[contender] = peak(*arguments) if settings.device == "cuda" else measuring.alone(peak, *arguments)
+            for contender in work.models:
+                with suppress(LeftOut):
+                    taken[contender] = measuring.alone(peak, name, contender, kind, settings, device=settings.device)
             times = {contender: measuring.spread(each) for contender, each in seconds.items()}
             cases.append({"case": f"{title}, {kind}, 1 x 4 views", "times": times, "peak": taken})
         print(f"  {title}: {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Iterable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +21,7 @@ PRETRAINED = Path(lsmgeo.models.__file__).parent / "pretrained"
 
 
 def collect(folder: Folder) -> list[Path]:
-    """Write what is to be committed of all finished runs.
-
-    Returns:
-        The files.
-    """
+    """Write what is to be committed of all finished runs, and tell the files."""
     written = []
     for experiment in ALL:
         if folder.is_done(experiment):
@@ -37,9 +32,8 @@ def collect(folder: Folder) -> list[Path]:
             if experiment.ships:
                 name = f"{experiment.model}-{experiment.preset}.safetensors"
                 written.append(write_atomic(PRETRAINED / name, weights.read_bytes()))
-            digest = kept["set"]
             if not RECIPE.is_file():
-                recipe = {"source": "synthetic-13", "shapes": SHAPES, **SET._asdict(), "sha256": digest}
+                recipe = {"source": "synthetic-13", "shapes": SHAPES, **SET._asdict(), "sha256": kept["set"]}
                 written.append(write_atomic(RECIPE, (json.dumps(recipe, indent=1) + "\n").encode()))
     return written
 
@@ -50,11 +44,8 @@ def keep(experiment: Experiment, folder: Folder) -> dict[str, Any]:
     config = json.loads((path / "config.json").read_text(encoding="utf-8"))
     config["data"]["source"] = "set"  # where it lies says nothing elsewhere
     log, start = read_log(path / "log.jsonl")
-    about = {
-        key: value for key, value in asdict(experiment).items() if key in ("what", "minutes", "ships", "is_tested")
-    }
     return {
-        **about,
+        **{key: getattr(experiment, key) for key in ("what", "minutes", "ships", "is_tested")},
         **json.loads((path / EVALUATION).read_text(encoding="utf-8")),
         "configuration": config,
         "shapes": start["shapes"],

@@ -48,11 +48,7 @@ class Experiment:
         return EVALUATION_MINUTES[self.output] + sum(EVALUATION_MINUTES[report] for report in self.reports)
 
     def config(self, folder: Path) -> TrainingConfig:
-        """The configuration of its training.
-
-        Args:
-            folder: of the shards.
-        """
+        """The configuration of its training on the shards of a folder."""
         values: dict[str, dict[str, Any]] = {
             "model": {"name": self.model, "preset": self.preset},
             "data": {"source": str(folder), "views": 4, "workers": 0},

@@ -13,40 +13,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from lsmgeo.cameras import CameraTensors
-from lsmgeo.classical import DepthMap, aggregate_views, matching_costs, sweep, sweep_planes
+from lsmgeo.classical import aggregate_views, matching_costs, sweep, sweep_planes
 from lsmgeo.classical.plane_sweep import slab_planes
 from lsmgeo.classical.winners import Winners
 from lsmgeo.errors import GridError, OptionError, ShapeError
 from tests.classical import analytic
-
-
-def swept(pictures: analytic.Pictures, planes: int = 64, spacing: str = "inverse", **options: Any):
-    """The depths, and the depth map of a sweep."""
-    cameras = cameras_of(pictures)
-    depths = sweep_planes(cameras, analytic.NEAR, analytic.FAR, planes, spacing)
-    return depths.numpy(), sweep(torch.from_numpy(pictures.images), cameras, depths, **options)
-
-
-def cameras_of(pictures: analytic.Pictures) -> CameraTensors:
-    return CameraTensors(torch.from_numpy(pictures.K), torch.from_numpy(pictures.E), *pictures.depth.shape)
-
-
-def within_one_plane(pictures: analytic.Pictures, depths: np.ndarray, found: DepthMap) -> float:
-    """The fraction of the surface's pixels."""
-    true = np.interp(-1 / pictures.depth, -1 / depths, np.arange(len(depths)))
-    return float((np.abs(found.planes.round().numpy() - true) <= 1)[pictures.mask].mean())
-
-
-def median_error(pictures: analytic.Pictures, depth: np.ndarray) -> float:
-    """Relative, over the surface's pixels."""
-    return float(np.median(np.abs(errors(pictures, depth))))
-
-
-def errors(pictures: analytic.Pictures, depth: np.ndarray) -> np.ndarray:
-    """Relative and signed, of the surface's pixels."""
-    true = pictures.depth[pictures.mask]
-    return (depth[pictures.mask] - true) / true
+from tests.classical.scored import cameras_of, errors, median_error, swept, within_one_plane
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -13,6 +13,7 @@ from lsmgeo.cameras import CameraTensors, select
 from lsmgeo.classical import Tsdf, extract_mesh, fuse_depth
 from lsmgeo.errors import CameraError, DTypeError, GridError, OptionError, ShapeError
 from tests import oracle
+from tests.classical.scored import to_box, to_ellipsoid
 from tests.classical.seen import Cameras, all_round, is_closed, volume
 from tests.oracle.solids import Ellipsoid, Faces, Part
 
@@ -46,18 +47,6 @@ def plane_depth(cameras, normal, offset, size=None):
 
 def centers_of(shape, lower, upper, pose=None):
     return oracle.voxel_sites(shape, np.array(lower), np.array(upper), np.eye(4) if pose is None else pose)
-
-
-def to_ellipsoid(points):
-    """First-order distance to the egg: ``(|S X| - 1) |S X| / |S^2 X|``, exact on the surface."""
-    local = points @ TURN
-    first, second = np.linalg.norm(local / RADII, axis=1), np.linalg.norm(local / RADII**2, axis=1)
-    return (first - 1) * first / second
-
-
-def to_box(points):
-    beyond = np.abs(points @ TURN) - HALF
-    return np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(1), 0)
 
 
 @pytest.mark.parametrize("size", [(40, 48), (31, 60)])
@@ -118,8 +107,8 @@ def test_the_mesh_of_a_plane_is_that_plane():
     ("parts", "distance", "true_volume", "bound"),
     [
         (BALL, lambda points: np.linalg.norm(points, axis=1) - 0.4, 4 / 3 * np.pi * 0.4**3, 0.2),
-        (EGG, to_ellipsoid, 4 / 3 * np.pi * RADII.prod(), 0.2),
-        (BOX, to_box, 8 * HALF.prod(), 0.5),
+        (EGG, lambda points: to_ellipsoid(points @ TURN, RADII), 4 / 3 * np.pi * RADII.prod(), 0.2),
+        (BOX, lambda points: to_box(points @ TURN, HALF), 8 * HALF.prod(), 0.5),
     ],
     ids=["ball", "egg", "box"],
 )

@@ -78,7 +78,7 @@ def test_a_model_that_differs_on_hand_written_operators_is_not_timed(name):
         work.check()
 
 
-@pytest.mark.skipif(not measuring.can_measure(), reason="this system tells no peak memory")
+@pytest.mark.skipif(not measuring.REFERENCES.exists(), reason="this system tells no peak memory")
 @pytest.mark.parametrize("count", [20_000_000, 100_000_000])
 def test_a_known_allocation_is_measured(count):
     # What else the process holds by then comes and goes by a megabyte or two.
@@ -105,7 +105,7 @@ def test_a_known_allocation_is_measured(count):
 )
 def test_each_command_prints_its_table_and_keeps_what_docs_read(name, printed, tmp_path, monkeypatch, capsys):
     # No process of its own is forked off: that takes seconds each.
-    monkeypatch.setattr(measuring, "alone", lambda function, *arguments: function(*arguments))
+    monkeypatch.setattr(measuring, "alone", lambda function, *arguments, **_: function(*arguments))
     monkeypatch.setattr(torch, "set_num_threads", lambda number: None)
     monkeypatch.delenv("LSMGEO_TEST_DATA", raising=False)
     command.main([name, "--quick", "--repeats", "1", "--results", str(tmp_path)])

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from benchmarks import compiled, rivals, styles
+from benchmarks import compiled, rivals
 from benchmarks.problems import LeftOut, Run, Scene, channels_last
 from lsmgeo import functional, rays
 from lsmgeo._sites import image_sites, sweep_sites
@@ -124,11 +124,11 @@ CONTENDERS: Mapping[str, Callable[[Scene], Run]] = {
     COMPILED: compiled.contender,
     COMPILED_ANY: partial(compiled.contender, dynamic=True),
     AUTOMATIC: partial(compiled.contender, automatic=True),
-    WARPER: styles.depth_warper,
-    HOMOGRAPHY: styles.homographies,
-    ATLAS: styles.running_mean,
-    MVSNET: styles.variance_volume,
-    DOT: styles.dot_volume,
+    WARPER: rivals.depth_warper,
+    HOMOGRAPHY: rivals.homographies,
+    ATLAS: rivals.running_mean,
+    MVSNET: rivals.variance_volume,
+    DOT: rivals.dot_volume,
 }
 
 

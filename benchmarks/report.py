@@ -46,9 +46,9 @@ def goal_rows(cases: Cases) -> Rows:
     rows = [["work", "compared", "ratio", "target", ""]]
     for case in cases:
         for found in case.get("goals", []):
-            ratio = "—" if found["ratio"] is None else f"{found['ratio']:.2f}"
+            reached = "—" if found["ratio"] is None else f"{found['ratio']:.2f}"
             verdict = said(found["met"]) or f"not measured: {found['reason']}"
-            rows.append([case["case"], found["goal"], ratio, found["target_text"], verdict])
+            rows.append([case["case"], found["goal"], reached, found["target_text"], verdict])
     return rows
 
 

@@ -19,6 +19,7 @@ pytestmark = pytest.mark.timeout(120)
 LITTLE, BIG, TEXT = (writers.ply(form) for form in ("binary_little_endian", "binary_big_endian", "ascii"))
 HEAD = LITTLE.index(b"end_header\n") + len(b"end_header\n")
 FIRST = struct.pack("<4i", *writers.QUADS[0])
+PACKED = {"attributes": {"POSITION": 0}, "extensions": {"KHR_draco_mesh_compression": {"bufferView": 0}}}
 MANY = str(10**15).encode()
 
 
@@ -111,7 +112,8 @@ ATTACKS = [
     ("every.glb", changed(**accessor(1, count=10**12)), "whole number|more than it can hold"),
     ("zeros.glb", changed(**accessor(0, count=10**9, bufferView=None)), "sparse or empty"),
     ("sparse.glb", changed(**accessor(0, sparse={"count": 10**9})), "sparse or empty"),
-    ("offset.glb", changed(**accessor(0, byteOffset=-8)), "damaged"),
+    ("offset.glb", changed(**accessor(0, byteOffset=-8)), "whole number"),
+    ("stride.glb", changed(bufferViews=[{"buffer": 0, "byteLength": 96, "byteStride": -9}] * 2), "whole number"),
     ("kind.glb", changed(**accessor(0, componentType=77)), "damaged"),
     ("width.glb", changed(**accessor(0, type="VEC2")), "damaged"),
     ("index.glb", changed(**accessor(1, bufferView=0)), "names vertex"),
@@ -125,7 +127,8 @@ ATTACKS = [
     ("infinite.glb", changed(nodes=[{"mesh": 0, "scale": [1e300, 1, 1]}]), "1e15"),
     ("matrix.glb", changed(nodes=[{"mesh": 0, "matrix": [1, 2]}]), "damaged"),
     ("draco.glb", changed(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco"),
-    ("strip.glb", changed(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 5}]}]), "strips or fans"),
+    ("packed.glb", changed(meshes=[{"primitives": [PACKED]}]), "compressed"),
+    ("strip.glb", changed(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 5}]}]), "strips, fans"),
     ("lines.glb", changed(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 1}]}]), "holds no face"),
     ("list.gltf", b"[]", "damaged"),
     ("nesting.gltf", b"[" * 200_000, "damaged"),

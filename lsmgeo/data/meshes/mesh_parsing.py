@@ -25,6 +25,7 @@ RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<
 # Bytes of glTF's components, numbers of its types, and extensions that leave triangles as they are.
 BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+DRACO = "KHR_draco_mesh_compression"
 HARMLESS = ("KHR_materials_", "KHR_texture_transform", "KHR_lights_punctual")
 
 Materials = Mapping[str, Sequence[float]]
@@ -218,11 +219,18 @@ def _gltf(content: bytes, max_faces: int, text: Any) -> Parsed:
         raise Unreadable("has a buffer outside the file, which is not read")
     if any("sparse" in accessor or "bufferView" not in accessor for accessor in accessors):
         raise Unreadable("has a sparse or empty accessor, which is not read")
+    # trimesh itself compares these with the buffers by assertions, which Python may be told to leave out.
+    for part in (*views, *accessors):
+        for name in ("byteOffset", "byteLength", "byteStride"):
+            _whole(part.get(name, 0))
     held = [BYTES[a["componentType"]] * WIDTHS[a["type"]] * _whole(a["count"]) for a in accessors]
-    if sum(held) + sum(_whole(view["byteLength"]) for view in views) > 8 * len(content):
+    if sum(held) + sum(view["byteLength"] for view in views) > 8 * len(content):
         raise Unreadable("announces more than it can hold")
-    if any(primitive.get("mode", 4) not in (0, 1, 3, 4) for primitive in primitives):
-        raise Unreadable("has strips or fans of triangles, which are not read")
+    if any(
+        primitive.get("mode", 4) not in (0, 1, 3, 4) or DRACO in primitive.get("extensions", {})
+        for primitive in primitives
+    ):
+        raise Unreadable("has strips, fans or compressed triangles, which are not read")
     # A tree visits each node once: a second visit is a cycle or a node with two parents.
     roots = document["scenes"][_whole(document.get("scene", 0))].get("nodes", [])
     visited = [*roots, *(child for node in nodes for child in node.get("children", []))]

@@ -98,6 +98,20 @@ def check(scene: Scene, runs: Mapping[str, Run]) -> tuple[dict[str, Tensor], dic
     return cotangents, first
 
 
+def check_kernel(scene: Scene, kernel: Callable[[], tuple[Tensor, Tensor]], run: Run) -> None:
+    """Compare the kernel alone with a contender that `check` has passed.
+
+    Raises:
+        Different: it is not equal up to rounding.
+    """
+    limit, inputs = tolerance(scene.problem), leaves(scene)
+    shape = forward(run, inputs)[0].shape
+    output, gradient = kernel()
+    expected, _, gradients = differentiate(run, inputs, scene.cotangent(output).reshape(shape))
+    compare("kernel: values", output.reshape(shape), expected.detach(), limit)
+    compare("kernel: gradient", gradient, gradients[0], limit)
+
+
 def timings(
     label: str,
     problem: Problem,
@@ -124,11 +138,7 @@ def timings(
     if floors:
         try:
             kernel = who.kernel(scene)
-            output, gradient = kernel[BOTH]()
-            cotangent, limit = scene.cotangent(output).reshape(cotangents[who.OURS].shape), tolerance(problem)
-            expected, _, gradients = differentiate(runs[who.OURS], inputs, cotangent)
-            compare(f"{who.KERNEL}: values", output.reshape(expected.shape), expected.detach(), limit)
-            compare(f"{who.KERNEL}: gradient", gradient, gradients[0], limit)
+            check_kernel(scene, kernel[BOTH], runs[who.OURS])
         except LeftOut as reason:
             left_out[who.KERNEL] = str(reason)
     cases = []

@@ -15,9 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import kornia
 import torch
 from torch.utils.benchmark import timer
 
+import lsmgeo
 from benchmarks.problems import LeftOut
 
 RESULTS = Path(__file__).parent / "results"
@@ -158,10 +160,6 @@ def huge_pages() -> str:
 
 def machine(device: str = "cpu") -> dict[str, Any]:
     """Where and when something was measured."""
-    import kornia
-
-    import lsmgeo
-
     return {
         "device": torch.cuda.get_device_name() if device == "cuda" else processor(),
         "vector_instructions": torch.backends.cpu.get_cpu_capability(),

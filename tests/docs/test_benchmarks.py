@@ -69,6 +69,14 @@ def test_a_contender_that_differs_is_not_timed(fault, what, monkeypatch):
         comparing.timings("work", PROBLEMS["unproject"], ["faulty"], Settings(repeats=1))
 
 
+def test_a_kernel_that_differs_is_not_timed():
+    scene = Scene(PROBLEMS["sweep"])
+    run = contenders.ours(scene)
+    output, _ = comparing.forward(run, comparing.leaves(scene))
+    with pytest.raises(comparing.Different, match="kernel: values differ"):
+        comparing.check_kernel(scene, lambda: (1.001 * output, scene.source), run)
+
+
 @pytest.mark.parametrize("name", models.MODELS)
 def test_a_model_that_differs_on_hand_written_operators_is_not_timed(name):
     work = models.Work(name, Settings(quick=True), scenes=2, views=2)

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from lsmgeo import cli, data
-from lsmgeo.data.object_trees import read_splits
+from lsmgeo.data.convert_set import read_splits
 from lsmgeo.data.sources import split_by_name
 from lsmgeo.errors import DataError, OptionError
 from tests.data.hostile import judged, mutated

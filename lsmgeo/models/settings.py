@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections.abc
 import contextlib
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
@@ -37,7 +38,7 @@ def check_settings(who: str, settings: Any, whole: Limits = (1, LARGEST_SIDE), *
         limits: by the names of settings, the least and the largest number.
 
     Raises:
-        OptionError: the first setting that is none, with what was expected and what came.
+        OptionError: the first invalid setting, with what was expected and what came.
     """
     kinds = get_type_hints(type(settings))
     for item in fields(settings):
@@ -71,7 +72,8 @@ def _converted(value: Any, kind: Any, least: float, most: float) -> Any:
     elif kind in (str, bool, NoneType) and isinstance(value, kind):
         return value
     elif kind in NUMBERS and isinstance(value, NUMBERS[kind]) and not isinstance(value, bool):
-        if least <= value <= most and math.isfinite(value):
+        # An int of any length is below infinity.
+        if least <= value <= min(most, sys.float_info.max):
             return kind(value)
     raise TypeError
 

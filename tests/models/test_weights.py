@@ -237,6 +237,8 @@ def test_tensors_that_do_not_fit_the_settings_are_refused_by_name(path, model, c
         ({"name": "voxel-lsm", "hidden_channels": "many"}, "holds settings of no model"),
         ({"name": "voxel-lsm", "encoder_channels": None}, "holds settings of no model"),
         ({"name": ["voxel-lsm"]}, "holds settings of no model"),
+        ({"name": "depth-lsm", "far": 10**400}, "holds settings of no model .*far must be float, above 0"),
+        ({"name": "depth-lsm", "far": float("nan")}, "holds settings of no model .*far must be float, above 0"),
     ],
 )
 def test_settings_of_no_model_are_refused(path, settings, match):

@@ -267,9 +267,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("lsmgeo: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        # Whoever read has read enough, as head does; what is left to print goes nowhere.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        return 141
+        try:
+            sys.stdout.flush()
+        except BrokenPipeError:
+            # Whoever read has read enough, as head does; what is left to print goes nowhere.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            return 141
+        raise
 
 
 def _run(arguments: Sequence[str] | None) -> int:

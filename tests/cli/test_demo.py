@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -134,6 +135,12 @@ def test_a_reader_that_has_read_enough_ends_a_command_quietly(capfd):
 
     assert in_child(ask_for_help, quiet=False) == 141
     assert capfd.readouterr().err == ""
+
+
+def test_another_broken_pipe_is_told(monkeypatch):
+    monkeypatch.setattr(cli, "_run", mock.Mock(side_effect=BrokenPipeError("of a worker")))
+    with pytest.raises(BrokenPipeError, match="of a worker"):
+        cli.main([])
 
 
 def interrupt(*_, **__):

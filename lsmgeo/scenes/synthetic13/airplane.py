@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from lsmgeo.scenes.solids import Solid, box, cone, cylinder, ellipsoid
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
-from lsmgeo.scenes.synthetic13.parts import bar, block, pair, wheel, wing
+from lsmgeo.scenes.synthetic13.parts import Pair, Point, bar, block, pair, rod, slab, wheel, wing
 
 __all__ = ["build"]
 
@@ -82,7 +82,7 @@ def _fuselage(p: Parameters, kind: str, colours: Palette, radius: float) -> list
     nose, rear = p.uniform("nose_length", 0.12, 0.22), p.uniform("tail_length", 0.25, 0.4)
     front, back, lift = 0.5 - nose, rear - 0.5, 0.4 * radius
     parts = [
-        cylinder((back, 0, 0), (front, 0, 0), radius, colours.body),
+        rod((back, 0, 0), front, radius, colours.body),
         cone((back, 0, 0), (-0.5, lift, 0), radius, 0.35 * radius, colours.body),
     ]
     if kind == "delta fighter":
@@ -126,14 +126,7 @@ def _tail(p: Parameters, tail: str, colours: Palette, radius: float) -> list[Sol
 
 
 def _engines(
-    p: Parameters,
-    kind: str,
-    colours: Palette,
-    radius: float,
-    span: float,
-    root: tuple[float, float],
-    sweep: float,
-    dihedral: float,
+    p: Parameters, kind: str, colours: Palette, radius: float, span: float, root: Pair, sweep: float, dihedral: float
 ) -> list[Solid]:
     size = p.uniform("engine_size", 0.024, 0.038)
     x, y = root
@@ -147,7 +140,7 @@ def _engines(
         return _propeller((0.5, 0, 0), p.uniform("propeller", 0.1, 0.16), colours)
     if kind == "rear jets":
         side = radius + 0.9 * size
-        engine = cylinder((-0.36, 0.4 * radius, side), (-0.2, 0.4 * radius, side), size, colours.detail)
+        engine = rod((-0.36, 0.4 * radius, side), -0.2, size, colours.detail)
         return pair(engine, block((-0.33, 0.3 * radius, 0), (-0.23, 0.3 * radius + 0.025, side), colours.body))
     parts = []
     for share in (0.3,) if kind == "airliner" else (0.3, 0.6):
@@ -162,7 +155,7 @@ def _engines(
     return pair(*parts)
 
 
-def _propeller(hub: tuple[float, float, float], length: float, colours: Palette) -> list[Solid]:
+def _propeller(hub: Point, length: float, colours: Palette) -> list[Solid]:
     x, y, z = hub
     blades = [box(hub, (0.02, 2 * length, 0.03), colours.dark).rotated(0, turn, hub) for turn in (30, 120)]
     return [*blades[:1], cone((x - 0.02, y, z), (x + 0.035, y, z), 0.025, 0.008, colours.detail), blades[1]]
@@ -181,5 +174,5 @@ def _gear(p: Parameters, gear: str, colours: Palette, radius: float, place: floa
     side = 0.09 if kind != "glider" else 0.05
     main = [bar((place - 0.02, -drop, side), (place - 0.02, -0.3 * radius, 0.5 * radius), 0.026, 0.026, colours.detail)]
     main += wheel((place - 0.02, -drop, side), 0.032, 0.026, colours.dark, colours.detail)[:1]
-    nose = [block((0.33, -drop, -0.013), (0.356, -0.2 * radius, 0.013), colours.detail)]
+    nose = [slab((0.33, -drop), (0.356, -0.2 * radius), 0.013, colours.detail)]
     return [*pair(*main), *nose, cylinder((0.343, -drop, -0.014), (0.343, -drop, 0.014), 0.028, colours.dark)]

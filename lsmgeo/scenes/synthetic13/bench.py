@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from lsmgeo.scenes.solids import Solid, box, ellipsoid
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
-from lsmgeo.scenes.synthetic13.parts import bar, block, pair, rack, spaced, window
+from lsmgeo.scenes.synthetic13.parts import Point, bar, block, pair, rack, slab, spaced, window
 
 __all__ = ["build"]
 
@@ -32,9 +32,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     # The slats are the upper half of their seat.
     parts += _support(p, support, colours, height - thickness * (0.5 if seat == "slats" else 1.0), x, side, width)
     drop = p.uniform("beam_height", 0.03, 0.1)
-    parts.append(
-        block((-0.2 * x, height - thickness - drop, -side), (0.2 * x, height - 0.4 * thickness, side), colours.trim)
-    )
+    parts.append(slab((-0.2 * x, height - thickness - drop), (0.2 * x, height - 0.4 * thickness), side, colours.trim))
     back = p.choice("back", ("none", "plank", "slats", "bars", "frame"))
     if back == "none":
         return parts
@@ -59,9 +57,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     return parts
 
 
-def _seat(
-    p: Parameters, seat: str, colours: Palette, low: tuple[float, float, float], high: tuple[float, float, float]
-) -> list[Solid]:
+def _seat(p: Parameters, seat: str, colours: Palette, low: Point, high: Point) -> list[Solid]:
     if seat == "slats":
         bearers = [
             block((low[0], low[1], place - 0.04), (high[0], 0.4 * low[1] + 0.6 * high[1], place + 0.04), colours.trim)
@@ -120,12 +116,12 @@ def _back(p: Parameters, back: str, colours: Palette, low: float, x: float, z: f
         for place in (-z + 0.04, 0.0, z - 0.04)
     ]
     if back == "plank":
-        return [block((-x, low, -z), (-x + thick, top, z), colours.body)]
+        return [slab((-x, low), (-x + thick, top), z, colours.body)]
     if back == "slats":
         return posts + rack(
             (-x, low + 0.25 * tall, -z), (-x + thick, top, z), 1, p.count("back_slats", 2, 4), colours.body, 0.65
         )
-    rails = [block((-x, y - 0.05, -z), (-x + thick, y, z), colours.trim) for y in (low + 0.22 * tall, top)]
+    rails = [slab((-x, y - 0.05), (-x + thick, y), z, colours.trim) for y in (low + 0.22 * tall, top)]
     if back == "bars":
         count = p.count("bars", 7, 12)
         return (

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from lsmgeo.scenes.solids import Solid, box, sphere
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
-from lsmgeo.scenes.synthetic13.parts import bar, block, pair, spaced
+from lsmgeo.scenes.synthetic13.parts import Point, bar, block, pair, slab, spaced
 
 __all__ = ["build"]
 
 KINDS = ("bookcase", "doors", "drawers", "shelf over doors", "grid", "hutch", "ladder shelf", "niche", "bookcase")
-Corner = tuple[float, float, float]
 
 
 def build(p: Parameters, colours: Palette) -> list[Solid]:
@@ -55,16 +54,16 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
             front_low, front_high = (-x, lift, edge + wall), high
         else:
             edge = lift + (1 - room) * height
-            hole = block((-0.7 * x, edge, -z + wall), (2 * x, lift + height - wall, z - wall), colours.body)
+            hole = slab((-0.7 * x, edge), (2 * x, lift + height - wall), z - wall, colours.body)
             front_low, front_high = low, (x, edge - wall, z)
         parts += [block(low, high, colours.body).minus(hole), *_fronts(p, "doors", colours, front_low, front_high)]
     over = p.uniform("overhang", 0.02, 0.06) if p.choice("top", ("flush", "overhanging")) == "overhanging" else 0.0
     top_x, top = high[0] if kind != "hutch" else -x + shallow, high[1] + p.uniform("top_thickness", 0.02, 0.08)
-    parts.append(block((-x, high[1] - 0.01, -z - over), (top_x + over, top, z + over), colours.trim))
+    parts.append(slab((-x, high[1] - 0.01), (top_x + over, top), z + over, colours.trim))
     return parts
 
 
-def _shelves(p: Parameters, colours: Palette, low: Corner, high: Corner, wall: float, *, uprights: bool) -> list[Solid]:
+def _shelves(p: Parameters, colours: Palette, low: Point, high: Point, wall: float, *, uprights: bool) -> list[Solid]:
     """An open case: sides, top, bottom, shelves, a back unless it is left out."""
     (a, b, c), (d, e, f) = low, high
     parts = [
@@ -94,7 +93,7 @@ def _shelves(p: Parameters, colours: Palette, low: Corner, high: Corner, wall: f
     return parts
 
 
-def _fronts(p: Parameters, kind: str, colours: Palette, low: Corner, high: Corner) -> list[Solid]:
+def _fronts(p: Parameters, kind: str, colours: Palette, low: Point, high: Point) -> list[Solid]:
     """Doors or drawers with handles, a little proud of the front."""
     (_, b, c), (x, e, f) = low, high
     c, f = c + p.uniform("stile", 0.0, 0.05), f - p.numbers["stile"]
@@ -134,7 +133,7 @@ def _stand(p: Parameters, stand: str, colours: Palette, lift: float, x: float, z
         return []
     width = p.uniform("stand_width", 0.04, 0.09)
     if stand == "plinth":
-        return [block((-x + 0.02, 0, -z + width), (x - width, lift + 0.01, z - width), colours.detail)]
+        return [slab((-x + 0.02, 0), (x - width, lift + 0.01), z - width, colours.detail)]
     if stand == "wheels":
         return pair(*(sphere((s * (x - width), lift / 2, z - width), lift / 2 + 0.02, colours.dark) for s in (-1, 1)))
     lean = 0.5 * width
@@ -162,6 +161,6 @@ def _ladder(p: Parameters, colours: Palette, height: float, width: float, depth:
     shelves = []
     for y in spaced(0, height, rows):
         front = x - lean * y / height
-        shelves.append(block((-x, y - wall / 2, -z), (front + 0.02 + over, y + wall / 2, z), colours.trim))
-    shelves.append(block((-x, height - rail, -z), (-x + post, height, z), colours.trim))
+        shelves.append(slab((-x, y - wall / 2), (front + 0.02 + over, y + wall / 2), z, colours.trim))
+    shelves.append(slab((-x, height - rail), (-x + post, height), z, colours.trim))
     return uprights + rear + shelves

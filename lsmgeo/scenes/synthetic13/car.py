@@ -7,9 +7,9 @@ wheel, spoiler).
 
 from __future__ import annotations
 
-from lsmgeo.scenes.solids import Solid, box, cylinder, ellipsoid, sphere
+from lsmgeo.scenes.solids import Solid, box, ellipsoid, sphere
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
-from lsmgeo.scenes.synthetic13.parts import bar, below, block, kept, pair, wheel
+from lsmgeo.scenes.synthetic13.parts import Pair, bar, below, block, kept, pair, rod, slab, wheel
 
 __all__ = ["build"]
 
@@ -55,7 +55,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
 
     parts = _body(p, kind, colours, (x, z), clearance, waist)
     if kind == "convertible":
-        tub = block((window, clearance + 0.3 * belt, -z + 0.18), (windscreen, waist + 1.0, z - 0.18), colours.dark)
+        tub = slab((window, clearance + 0.3 * belt), (windscreen, waist + 1.0), z - 0.18, colours.dark)
         parts[0] = parts[0].minus(tub)
         glass = bar((windscreen, waist - 0.03, 0), (windscreen - 0.6 * cabin, top, 0), 0.12, width - 0.2, colours.dark)
         seats = [
@@ -72,11 +72,11 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     else:
         parts += _cabin(kind, colours, (window, windscreen), (waist, top), z, rake * cabin, slope * cabin)
     if kind == "pickup":
-        bed = block((-x + 0.12, clearance + 0.35 * belt, -z + 0.14), (window - 0.1, waist + 1, z - 0.14), colours.dark)
+        bed = slab((-x + 0.12, clearance + 0.35 * belt), (window - 0.1, waist + 1), z - 0.14, colours.dark)
         parts[0] = parts[0].minus(bed)
     if kind == "lorry":
         cargo = p.uniform("cargo_height", 0.7, 1.25) * cabin
-        parts.append(block((-x, waist - 0.02, -1.05 * z), (window - 0.1, waist + cargo, 1.05 * z), colours.trim))
+        parts.append(slab((-x, waist - 0.02), (window - 0.1, waist + cargo), 1.05 * z, colours.trim))
     base = p.uniform("wheelbase", 0.56, 0.66) * length / 2
     side = z - 0.35 * tread
     for place in (base, -base):
@@ -88,9 +88,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     return [*parts, bumper, *_extras(p, kind, colours, (window, windscreen), (waist, top), (x, z), lean)]
 
 
-def _body(
-    p: Parameters, kind: str, colours: Palette, half: tuple[float, float], low: float, waist: float
-) -> list[Solid]:
+def _body(p: Parameters, kind: str, colours: Palette, half: Pair, low: float, waist: float) -> list[Solid]:
     """The lower body, its bonnet sloping to the front; the first part is the one that may be hollowed."""
     x, z = half
     nose = p.uniform("nose_drop", 0.1, 0.35) * (waist - low)
@@ -100,23 +98,15 @@ def _body(
         wings = [
             ellipsoid((s * 0.62 * x, low + 0.3, 0.8 * z), (0.28 * x, 0.4, 0.26 * z), colours.trim) for s in (-1, 1)
         ]
-        return [hull, *pair(*wings), block((-0.75 * x, low, -0.9 * z), (0.75 * x, low + 0.15, 0.9 * z), colours.trim)]
-    body = block((-x, low, -z), (x, waist, z), colours.body)
+        return [hull, *pair(*wings), slab((-0.75 * x, low), (0.75 * x, low + 0.15), 0.9 * z, colours.trim)]
+    body = slab((-x, low), (x, waist), z, colours.body)
     return [
         below(body, (x - bonnet, waist), (x, waist - nose)),
-        block((-0.98 * x, low - 0.05, -0.8 * z), (0.97 * x, low + 0.1, 0.8 * z), colours.dark),
+        slab((-0.98 * x, low - 0.05), (0.97 * x, low + 0.1), 0.8 * z, colours.dark),
     ]
 
 
-def _cabin(
-    kind: str,
-    colours: Palette,
-    ends: tuple[float, float],
-    levels: tuple[float, float],
-    z: float,
-    rake: float,
-    slope: float,
-) -> list[Solid]:
+def _cabin(kind: str, colours: Palette, ends: Pair, levels: Pair, z: float, rake: float, slope: float) -> list[Solid]:
     """Panes all around, a roof and pillars."""
     (rear, front), (waist, top) = ends, levels
     if kind == "beetle":
@@ -130,9 +120,9 @@ def _cabin(
         pillar = kept(kept(shell, (middle - 0.2, 0, 0), (1, 0, 0)), (middle - 0.05, 0, 0), (-1, 0, 0))
         return [panes, foot, roof, pillar]
     tumble = 0.12 * z
-    glass = block((rear, waist - 0.05, -0.96 * z), (front, top - 0.06, 0.96 * z), colours.dark)
+    glass = slab((rear, waist - 0.05), (front, top - 0.06), 0.96 * z, colours.dark)
     glass = below(below(glass, (front - rake, top), (front, waist)), (rear, waist), (rear + slope, top))
-    roof = block((rear + slope, top - 0.1, -0.96 * z + tumble), (front - rake, top, 0.96 * z - tumble), colours.body)
+    roof = slab((rear + slope, top - 0.1), (front - rake, top), 0.96 * z - tumble, colours.body)
     place = 0.5 * (rear + slope + front - rake)
     pillars = [
         bar(
@@ -159,20 +149,14 @@ def _cabin(
 
 def _lamps(lamps: str, colours: Palette, x: float, z: float, level: float) -> list[Solid]:
     if lamps == "round":
-        front = cylinder((x - 0.1, level, 0.68 * z), (x + 0.04, level, 0.68 * z), 0.13, colours.detail)
+        front = rod((x - 0.1, level, 0.68 * z), x + 0.04, 0.13, colours.detail)
     else:
         front = box((x - 0.02, level, 0.66 * z), (0.12, 0.16, 0.42 * z), colours.detail)
     return pair(front, box((-x + 0.02, level, 0.75 * z), (0.1, 0.14, 0.3 * z), colours.trim))
 
 
 def _extras(
-    p: Parameters,
-    kind: str,
-    colours: Palette,
-    ends: tuple[float, float],
-    levels: tuple[float, float],
-    half: tuple[float, float],
-    lean: tuple[float, float],
+    p: Parameters, kind: str, colours: Palette, ends: Pair, levels: Pair, half: Pair, lean: Pair
 ) -> list[Solid]:
     (rear, front), (waist, top), (x, z) = ends, levels, half
     first, last = rear + lean[1], front - lean[0]
@@ -211,9 +195,9 @@ def _racing_car(p: Parameters, colours: Palette, radius: float, tread: float) ->
     high, low = p.uniform("wing_height", 0.75, 1.1), 0.15
     waist = p.uniform("body_height", 0.5, 0.65)
     x, z = length / 2, track / 2
-    body = block((-x + 0.3, low, -tub), (0.35 * x, waist, tub), colours.body)
+    body = slab((-x + 0.3, low), (0.35 * x, waist), tub, colours.body)
     body = body.minus(sphere((-0.05 * x, waist + 0.05, 0), 0.28))
-    nose = block((0.3 * x, low + 0.03, -0.6 * tub), (x, waist - 0.02, 0.6 * tub), colours.body)
+    nose = slab((0.3 * x, low + 0.03), (x, waist - 0.02), 0.6 * tub, colours.body)
     parts = [
         body,
         below(nose, (0.3 * x, waist), (x, 0.55 * waist)),
@@ -223,7 +207,7 @@ def _racing_car(p: Parameters, colours: Palette, radius: float, tread: float) ->
         box((x - 0.1, low + 0.1, 0), (0.5, 0.12, 1.9 * z), colours.trim),
         box((-x + 0.25, high, 0), (0.5, 0.12, 1.3 * z), colours.trim),
         *pair(block((-x, 0.5 * waist, 0.62 * z), (-x + 0.5, high + 0.12, 0.68 * z), colours.detail)),
-        block((-x + 0.1, 0.4, -0.62 * z), (-x + 0.3, 0.6, 0.62 * z), colours.detail),
+        slab((-x + 0.1, 0.4), (-x + 0.3, 0.6), 0.62 * z, colours.detail),
     ]
     for place, size in ((0.66 * x, 1.0), (-x + 0.75, 1.15)):
         parts += pair(

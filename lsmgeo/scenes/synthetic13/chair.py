@@ -6,9 +6,9 @@ cushioned), a back (solid, vertical slats, horizontal slats, round, frame, none)
 
 from __future__ import annotations
 
-from lsmgeo.scenes.solids import Solid, box, cone, cylinder, ellipsoid
+from lsmgeo.scenes.solids import Solid, box, ellipsoid
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
-from lsmgeo.scenes.synthetic13.parts import bar, block, pair, rack, spokes, window
+from lsmgeo.scenes.synthetic13.parts import bar, block, pair, pillar, rack, rod, slab, spokes, window
 
 __all__ = ["build"]
 
@@ -31,16 +31,16 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     inset = 0.72 if seat == "round" else 1.0
     parts = _base(p, base, colours, floor, inset * x, inset * z)
     if seat == "round":
-        disc = cylinder((0, floor, 0), (0, height, 0), 1.0, colours.body)
+        disc = pillar((0, floor, 0), height, 1.0, colours.body)
         parts.append(disc.scaled((x, 1, z)))
         if back != "none":
-            parts.append(block((-x, floor, -z), (0, height, z), colours.body))
+            parts.append(slab((-x, floor), (0, height), z, colours.body))
     else:
-        parts.append(block((-x, floor, -z), (x, height, z), colours.body))
+        parts.append(slab((-x, floor), (x, height), z, colours.body))
     if seat == "cushioned":
         parts.append(ellipsoid((0, height, 0), (0.95 * x, thickness * 0.9, 0.95 * z), colours.trim))
     under, share = p.uniform("apron_height", 0.02, 0.07), p.uniform("apron_size", 0.5, 0.9) * inset
-    parts.append(block((-share * x, floor - under, -share * z), (share * x, floor + 0.01, share * z), colours.trim))
+    parts.append(slab((-share * x, floor - under), (share * x, floor + 0.01), share * z, colours.trim))
     if back != "none":
         lean = p.uniform("back_lean", 0, 22)
         parts += [part.rotated(2, lean, (-x, height, 0)) for part in _back(p, back, colours, height, x, z)]
@@ -70,17 +70,17 @@ def _base(p: Parameters, base: str, colours: Palette, floor: float, x: float, z:
         return pair(*legs, rail)
     if base == "pedestal":
         foot = p.uniform("foot_radius", 0.18, 0.34)
-        flare = cone((0, 0.03, 0), (0, 0.3 * floor, 0), 0.6 * foot, 0.5 * width, ground)
+        flare = pillar((0, 0.03, 0), 0.3 * floor, 0.6 * foot, ground, 0.5 * width)
         return [
-            cylinder((0, 0, 0), (0, 0.04, 0), foot, ground),
+            pillar((0, 0, 0), 0.04, foot, ground),
             flare,
-            cylinder((0, 0.02, 0), (0, top, 0), 0.7 * width, ground),
+            pillar((0, 0.02, 0), top, 0.7 * width, ground),
         ]
     if base == "star":
         reach, arms = p.uniform("star_reach", 0.24, 0.36), p.count("star_arms", 4, 6)
         wheels = [part.moved((0, -0.045, 0)) for part in spokes((0, 0.12, 0), reach, 0.06, arms, width, ground)]
-        post = cylinder((0, 0.05, 0), (0, top, 0), 0.7 * width, colours.detail)
-        return [*wheels, post, cylinder((0, 0.45 * floor, 0), (0, top, 0), 1.1 * width, ground)]
+        post = pillar((0, 0.05, 0), top, 0.7 * width, colours.detail)
+        return [*wheels, post, pillar((0, 0.45 * floor, 0), top, 1.1 * width, ground)]
     if base == "sled":
         inset = p.uniform("sled_inset", 0.0, 0.25) * x
         front, rear, side = x - inset, -x + inset, z - width / 2
@@ -102,7 +102,7 @@ def _back(p: Parameters, back: str, colours: Palette, height: float, x: float, z
         return [block(start, end, colours.body)]
     if back == "round":
         middle = height + 0.5 * tall
-        disc = cylinder((-x, 0, 0), (-x + thick, 0, 0), 1.0, colours.body).scaled((1, 0.55 * tall, narrow))
+        disc = rod((-x, 0, 0), -x + thick, 1.0, colours.body).scaled((1, 0.55 * tall, narrow))
         post = block((-x, low, 0.4 * narrow), (-x + 0.7 * thick, middle, 0.4 * narrow + 0.05), colours.trim)
         return [disc.moved((0, middle, 0)), *pair(post)]
     width = p.uniform("stile_width", 0.035, 0.07)
@@ -122,12 +122,8 @@ def _back(p: Parameters, back: str, colours: Palette, height: float, x: float, z
         return stiles + rack(
             (-x, height + 0.2 * tall, -inside), (-x + 0.8 * thick, top, inside), 1, count, colours.body, 0.6
         )
-    low_rail = block(
-        (-x, height + 0.25 * tall, -narrow), (-x + thick, height + 0.25 * tall + width, narrow), colours.trim
-    )
-    pad = block(
-        (-x + 0.2 * thick, height + 0.45 * tall, -inside), (-x + 0.9 * thick, top - 0.1 * tall, inside), colours.body
-    )
+    low_rail = slab((-x, height + 0.25 * tall), (-x + thick, height + 0.25 * tall + width), narrow, colours.trim)
+    pad = slab((-x + 0.2 * thick, height + 0.45 * tall), (-x + 0.9 * thick, top - 0.1 * tall), inside, colours.body)
     return [*stiles, head, low_rail, pad]
 
 

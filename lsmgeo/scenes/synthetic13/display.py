@@ -7,9 +7,9 @@ tube: swivel, feet, none).
 
 from __future__ import annotations
 
-from lsmgeo.scenes.solids import Solid, box, cone, cylinder
+from lsmgeo.scenes.solids import Solid, box, cylinder
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
-from lsmgeo.scenes.synthetic13.parts import bar, below, block, kept, pair, rack, spokes
+from lsmgeo.scenes.synthetic13.parts import bar, below, block, kept, pair, pillar, rack, rod, slab, spokes
 
 __all__ = ["build"]
 
@@ -53,7 +53,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     head = [part.rotated(2, tilt, (0, tall / 2, 0)).moved((0, rise, 0)) for part in (*screen, *back)]
     if kind == "tripod":
         reach, hub = p.uniform("foot_reach", 0.3, 0.55), p.uniform("hub_height", 0.5, 0.8) * rise
-        pole = cylinder((-thick - 0.02, 0.1, 0), (-thick - 0.02, rise + 0.5 * tall, 0), 0.035, colours.trim)
+        pole = pillar((-thick - 0.02, 0.1, 0), rise + 0.5 * tall, 0.035, colours.trim)
         return [
             *head,
             pole,
@@ -66,8 +66,8 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
 def _screen(colours: Palette, wide: float, tall: float, thick: float, bezel: float, chin: float) -> list[Solid]:
     """A slab from y = 0 with a pane on its front, which is at x = 0."""
     return [
-        block((-thick, 0, -wide / 2), (0, tall, wide / 2), colours.body),
-        block((-0.02, chin, -wide / 2 + bezel), (0.012, tall - bezel, wide / 2 - bezel), colours.dark),
+        slab((-thick, 0), (0, tall), wide / 2, colours.body),
+        slab((-0.02, chin), (0.012, tall - bezel), wide / 2 - bezel, colours.dark),
     ]
 
 
@@ -75,9 +75,10 @@ def _housing(p: Parameters, colours: Palette, wide: float, tall: float, thick: f
     """The housing behind a flat screen."""
     deep, share = p.uniform("housing_depth", 0.03, 0.12), p.uniform("housing_size", 0.4, 0.75)
     return [
-        block(
-            (-thick - deep, 0.5 * tall * (1 - share), -wide / 2 * share),
-            (-thick + 0.01, 0.5 * tall * (1 + share), wide / 2 * share),
+        slab(
+            (-thick - deep, 0.5 * tall * (1 - share)),
+            (-thick + 0.01, 0.5 * tall * (1 + share)),
+            wide / 2 * share,
             colours.trim,
         )
     ]
@@ -101,7 +102,7 @@ def _stand(
     broad = p.uniform("foot_width", 0.35, 0.7) * wide
     x, up = -0.5 * thick, rise + 0.5 * tall
     joint = _joint(rise, tall, thick, colours)
-    post = block((-thick - 0.1, 0, -neck / 2), (-thick - 0.04, up, neck / 2), colours.trim)
+    post = slab((-thick - 0.1, 0), (-thick - 0.04, up), neck / 2, colours.trim)
     if stand == "two feet":
         place = 0.36 * wide
         return pair(
@@ -111,22 +112,22 @@ def _stand(
         fork = [bar((reach, 0.0, 0.45 * broad), (-thick - 0.07, 0.06, 0.0), 0.12, 0.05, colours.trim)]
         return [post, joint, *pair(*fork)]
     if stand == "plate":
-        return [post, joint, block((-reach - 0.1, 0, -broad / 2), (reach, 0.035, broad / 2), colours.trim)]
+        return [post, joint, slab((-reach - 0.1, 0), (reach, 0.035), broad / 2, colours.trim)]
     if stand == "disc":
-        disc = cylinder((0, 0, 0), (0, 0.04, 0), 1.0, colours.trim).scaled((reach, 1, 0.5 * broad))
+        disc = pillar((0, 0, 0), 0.04, 1.0, colours.trim).scaled((reach, 1, 0.5 * broad))
         return [
             post,
             joint,
             disc.moved((-thick, 0, 0)),
-            cone((-thick - 0.07, 0.03, 0), (-thick - 0.07, 0.12, 0), 0.8 * neck, 0.4 * neck, colours.trim),
+            pillar((-thick - 0.07, 0.03, 0), 0.12, 0.8 * neck, colours.trim, 0.4 * neck),
         ]
     if stand == "arm":
         back = -thick - 0.35
         rods = [
-            cylinder((back, 0, 0), (back, up, 0), 0.04, colours.trim),
-            cylinder((back, up - 0.05, 0), (-thick, up - 0.05, 0), 0.035, colours.trim),
+            pillar((back, 0, 0), up, 0.04, colours.trim),
+            rod((back, up - 0.05, 0), -thick, 0.035, colours.trim),
         ]
-        return [*rods, joint, block((back - 0.12, 0, -0.12), (back + 0.12, 0.05, 0.12), colours.detail)]
+        return [*rods, joint, slab((back - 0.12, 0), (back + 0.12, 0.05), 0.12, colours.detail)]
     if stand == "easel":
         legs = [bar((-thick - 0.3, 0, 0.25 * broad), (-thick - 0.02, up, 0.12 * broad), 0.05, 0.05, colours.trim)]
         fronts = [bar((0.08, 0, 0.4 * broad), (-thick, rise + 0.1, 0.4 * broad), 0.05, 0.05, colours.trim)]
@@ -137,7 +138,7 @@ def _stand(
             box((-0.5 * thick, rise, 0), (thick + 0.1, 0.05, broad), colours.trim),
         ]
     sheet = bar((-thick - 0.35, 0, 0), (-thick, up, 0), 0.045, 0.5 * broad, colours.trim)
-    return [sheet, joint, block((-thick - 0.37, 0, -0.25 * broad), (reach, 0.035, 0.25 * broad), colours.trim)]
+    return [sheet, joint, slab((-thick - 0.37, 0), (reach, 0.035), 0.25 * broad, colours.trim)]
 
 
 def _laptop(p: Parameters, colours: Palette, screen: list[Solid], wide: float, tilt: float) -> list[Solid]:
@@ -152,18 +153,18 @@ def _laptop(p: Parameters, colours: Palette, screen: list[Solid], wide: float, t
         0.7,
     )
     keys = [part.moved((-0.18 * deep, 0, 0)) for part in keys]
-    pad = block((0.68 * deep, thick - 0.01, -0.15 * wide), (0.92 * deep, thick + 0.008, 0.15 * wide), colours.detail)
+    pad = slab((0.68 * deep, thick - 0.01), (0.92 * deep, thick + 0.008), 0.15 * wide, colours.detail)
     hinge = cylinder((0, thick, -0.4 * wide), (0, thick, 0.4 * wide), 0.03, colours.trim)
     angle = tilt + p.uniform("opening", 0, 18)
     lid = [part.rotated(2, angle).moved((0.02, thick - 0.01, 0)) for part in screen]
-    return [*lid, block((-0.02, 0, -wide / 2), (deep, thick, wide / 2), colours.body), *keys, pad, hinge]
+    return [*lid, slab((-0.02, 0), (deep, thick), wide / 2, colours.body), *keys, pad, hinge]
 
 
 def _tube(p: Parameters, colours: Palette, screen: list[Solid], wide: float, tall: float, thick: float) -> list[Solid]:
     """A cathode ray tube's box: it narrows towards the back."""
     deep, shrink = p.uniform("tube_depth", 0.45, 0.8), p.uniform("tube_shrink", 0.4, 0.75)
     z, end, narrow = wide / 2, -thick - deep, shrink * wide / 2
-    shell = block((end, 0.06 * tall, -0.96 * z), (-thick + 0.02, 0.97 * tall, 0.96 * z), colours.trim)
+    shell = slab((end, 0.06 * tall), (-thick + 0.02, 0.97 * tall), 0.96 * z, colours.trim)
     shell = below(shell, (end, shrink * tall), (-0.7 * thick, tall))
     for side in (-1, 1):
         shell = kept(shell, (end, 0, side * narrow), (z - narrow, 0, -side * (deep + thick)))
@@ -172,14 +173,11 @@ def _tube(p: Parameters, colours: Palette, screen: list[Solid], wide: float, tal
     x = -0.45 * (deep + thick)
     parts = [part.moved((0, lift, 0)) for part in (*screen, shell)]
     if stand == "swivel":
-        parts.append(cone((x, 0, 0), (x, lift + 0.12 * tall, 0), 0.3 * wide, 0.2 * wide, colours.detail))
+        parts.append(pillar((x, 0, 0), lift + 0.12 * tall, 0.3 * wide, colours.detail, 0.2 * wide))
     elif stand == "feet":
         parts += pair(
             block((-thick - 0.5 * deep, 0, 0.25 * wide), (-0.02, lift + 0.1 * tall, 0.33 * wide), colours.detail)
         )
     size = p.uniform("knob", 0.02, 0.035)
-    knobs = [
-        cylinder((-0.02, lift + y * tall, 0.44 * wide), (0.03, lift + y * tall, 0.44 * wide), size, colours.detail)
-        for y in (0.06, 0.14)
-    ]
+    knobs = [rod((-0.02, lift + y * tall, 0.44 * wide), 0.03, size, colours.detail) for y in (0.06, 0.14)]
     return parts + knobs

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from lsmgeo.scenes.solids import Solid, box, cone, cylinder, ellipsoid, half_space, sphere
+from lsmgeo.scenes.solids import Solid, box, cylinder, ellipsoid, half_space, sphere
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
-from lsmgeo.scenes.synthetic13.parts import block, ring, spokes, tube
+from lsmgeo.scenes.synthetic13.parts import Point, pillar, ring, slab, spokes, tube
 
 __all__ = ["build"]
 
@@ -59,9 +59,9 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
         reach, hub = p.uniform("leg_reach", 0.2, 0.38), p.uniform("hub_height", 0.8, 0.94) * top
         thick, wide = p.uniform("leg_width", 0.03, 0.06), p.uniform("hub_radius", 0.03, 0.06)
         legs = spokes((0, hub, 0), reach, hub, 3, thick, colours.trim, turn=30)
-        legs.append(cylinder((0, hub - 0.05, 0), (0, hub + 0.03, 0), wide, colours.detail))
-        return [*lamp, *legs, cylinder((0, hub - 0.03, 0), (0, top + 0.67 * tall, 0), 1.4 * rod, colours.detail)]
-    stem = cylinder((0, 0, 0), (0, top + 0.67 * tall, 0), rod, colours.detail)
+        legs.append(pillar((0, hub - 0.05, 0), hub + 0.03, wide, colours.detail))
+        return [*lamp, *legs, pillar((0, hub - 0.03, 0), top + 0.67 * tall, 1.4 * rod, colours.detail)]
+    stem = pillar((0, 0, 0), top + 0.67 * tall, rod, colours.detail)
     knot = p.uniform("knot", 0.25, 0.8) * (top - 0.15 * tall)
     lamp.append(sphere((0, knot, 0), p.uniform("knot_radius", 1.4, 2.4) * rod, colours.detail))
     parts = [*lamp, stem, *_foot(p, colours, foot, (0, 0, 0))]
@@ -77,9 +77,9 @@ def _pendant(p: Parameters, shade: str, colours: Palette, radius: float, tall: f
     top = drop + tall
     return [
         *_shade(p, shade, colours, (0, 0, 0), radius, tall),
-        cylinder((0, 0.5 * tall, 0), (0, top + 0.01, 0), 0.8 * rod, colours.detail),
-        cylinder((0, 0.8 * tall, 0), (0, tall + 0.05, 0), socket, colours.trim),
-        cone((0, top, 0), (0, top + high, 0), 0.5 * wide, wide, colours.trim),
+        pillar((0, 0.5 * tall, 0), top + 0.01, 0.8 * rod, colours.detail),
+        pillar((0, 0.8 * tall, 0), tall + 0.05, socket, colours.trim),
+        pillar((0, top, 0), top + high, 0.5 * wide, colours.trim, wide),
     ]
 
 
@@ -92,9 +92,7 @@ def _wall_lamp(p: Parameters, shade: str, colours: Palette, radius: float, tall:
     return [plate, *ring(bend, rod, colours.detail), *_shade(p, shade, colours, (0, 0, 0), 0.6 * radius, 0.6 * tall)]
 
 
-def _shade(
-    p: Parameters, shade: str, colours: Palette, base: tuple[float, float, float], radius: float, tall: float
-) -> list[Solid]:
+def _shade(p: Parameters, shade: str, colours: Palette, base: Point, radius: float, tall: float) -> list[Solid]:
     """A shade whose lower rim is centred at ``base``, on a cross bar that joins it to the rod."""
     x, y, z = base
     bottom, top = (x, y, z), (x, y + tall, z)
@@ -105,7 +103,7 @@ def _shade(
         end = p.uniform("shade_top", 0.35, 0.75) if shade == "cone" else p.uniform("shade_top", 0.88, 1.0)
         # A plate closes the shade near its top.
         level, reach = y + 0.8 * tall, radius * (0.2 + 0.8 * end) - 0.012
-        plate = cylinder((x, level, z), (x, level + 0.03, z), reach, colours.trim)
+        plate = pillar((x, level, z), level + 0.03, reach, colours.trim)
         return [tube(bottom, top, radius, end * radius, min(0.035, 0.6 * end * radius), colours.body), plate]
     if shade == "stack":
         step = p.uniform("stack_step", 0.12, 0.26)
@@ -119,19 +117,19 @@ def _shade(
         ellipsoid((x, y - 0.03, z), (radius - 0.03, tall - 0.02, radius - 0.03)), half_space((x, y, z), (0, 1, 0))
     )
     bulb = sphere((x, y + 0.25 * tall, z), p.uniform("bulb", 0.22, 0.45) * radius, colours.trim)
-    holder = cylinder((x, y + 0.25 * tall, z), (x, y + 0.9 * tall, z), 0.03, colours.trim)
+    holder = pillar((x, y + 0.25 * tall, z), y + 0.9 * tall, 0.03, colours.trim)
     if shade == "bowl":
         return [part.scaled((1, -1, 1), (x, y + tall / 2, z)) for part in (dome, bulb, holder)]
     return [dome, bulb, holder]
 
 
-def _foot(p: Parameters, colours: Palette, radius: float, at: tuple[float, float, float]) -> list[Solid]:
+def _foot(p: Parameters, colours: Palette, radius: float, at: Point) -> list[Solid]:
     form, thick = p.choice("foot", ("disc", "cone", "block", "ball")), p.uniform("foot_height", 0.03, 0.07)
     x, _, z = at
     if form == "disc":
-        return [cylinder((x, 0, z), (x, thick, z), radius, colours.trim)]
+        return [pillar((x, 0, z), thick, radius, colours.trim)]
     if form == "cone":
-        return [cone((x, 0, z), (x, 3 * thick, z), radius, 0.2 * radius, colours.trim)]
+        return [pillar((x, 0, z), 3 * thick, radius, colours.trim, 0.2 * radius)]
     if form == "block":
         return [box((x, thick / 2, z), (1.8 * radius, thick, 1.8 * radius), colours.trim)]
     return [ellipsoid((x, 0, z), (radius, 2 * thick, radius), colours.trim).minus(half_space((x, 0, z), (0, 1, 0)))]
@@ -146,12 +144,12 @@ def _body(p: Parameters, colours: Palette, radius: float, low: float, high: floa
     if form == "vase":
         return [
             ellipsoid((0, low + 0.45 * tall, 0), (radius, 0.5 * tall, radius), colours.trim),
-            cone((0, low + 0.7 * tall, 0), (0, high, 0), 0.3 * radius, 0.6 * radius, colours.trim),
+            pillar((0, low + 0.7 * tall, 0), high, 0.3 * radius, colours.trim, 0.6 * radius),
         ]
     if form == "bottle":
         return [
-            cylinder((0, low - 0.02, 0), (0, low + 0.6 * tall, 0), radius, colours.trim),
-            cone((0, low + 0.6 * tall - 0.001, 0), (0, high, 0), radius, 0.25 * radius, colours.trim),
+            pillar((0, low - 0.02, 0), low + 0.6 * tall, radius, colours.trim),
+            pillar((0, low + 0.6 * tall - 0.001, 0), high, radius, colours.trim, 0.25 * radius),
         ]
     count = p.count("pieces", 2, 4)
     step = tall / count
@@ -174,9 +172,9 @@ def _desk(p: Parameters, colours: Palette, radius: float, rod: float, height: fl
     end = elbow + reach * np.array([np.cos(second), np.sin(second), 0])
     size, narrow = 0.7 * radius, p.uniform("shade_top", 0.15, 0.3)
     head = tube((0, -1.3 * size, 0), (0, 0.1, 0), size, narrow * size + 0.04, 0.035, colours.body)
-    cap = cylinder((0, 0.03, 0), (0, 0.12, 0), narrow * size + 0.05, colours.body)
+    cap = pillar((0, 0.03, 0), 0.12, narrow * size + 0.05, colours.body)
     bulb = sphere((0, -0.5 * size, 0), 0.35 * size, colours.detail)
-    stem = cylinder((0, -0.5 * size, 0), (0, 0.05, 0), 0.03, colours.detail)
+    stem = pillar((0, -0.5 * size, 0), 0.05, 0.03, colours.detail)
     tilt = p.uniform("head_tilt", 5, 40)
     return [
         *_foot(p, colours, foot, (0, 0, 0)),
@@ -193,9 +191,9 @@ def _chandelier(
     arms, reach = p.count("arms", 3, 6), p.uniform("reach", 0.3, 0.5)
     dip = p.uniform("dip", 0.06, 0.16)
     parts = [
-        cylinder((0, -dip, 0), (0, 0.7 * height, 0), 1.2 * rod, colours.trim),
+        pillar((0, -dip, 0), 0.7 * height, 1.2 * rod, colours.trim),
         ellipsoid((0, 0, 0), (0.07, p.uniform("hub_height", 0.06, 0.13), 0.07), colours.trim),
-        cone((0, 0.7 * height - 0.04, 0), (0, 0.7 * height + 0.01, 0), 0.05, 0.1, colours.trim),
+        pillar((0, 0.7 * height - 0.04, 0), 0.7 * height + 0.01, 0.05, colours.trim, 0.1),
         sphere((0, -dip, 0), p.uniform("finial", 0.03, 0.06), colours.detail),
     ]
     candle = shade in ("globe", "stack", "bowl")
@@ -204,11 +202,11 @@ def _chandelier(
         arm = ring([(0, 0, 0), (0.55 * reach, -dip, 0), (reach, 0.02, 0)], 0.8 * rod, colours.trim)
         if candle:
             arm += [
-                cylinder((reach, 0, 0), (reach, 0.6 * tall, 0), 0.03, colours.body),
+                pillar((reach, 0, 0), 0.6 * tall, 0.03, colours.body),
                 ellipsoid((reach, 0.6 * tall + 0.04, 0), (0.03, 0.06, 0.03), colours.detail),
             ]
         else:
-            arm += [cone((reach, 0, 0), (reach, 0.6 * tall, 0), 0.45 * radius, 0.45 * narrow * radius, colours.body)]
+            arm += [pillar((reach, 0, 0), 0.6 * tall, 0.45 * radius, colours.body, 0.45 * narrow * radius)]
         parts += [part.rotated(1, float(angle)) for part in arm]
     return parts
 
@@ -222,9 +220,9 @@ def _lantern(p: Parameters, colours: Palette, radius: float, tall: float, rod: f
     low, most = {"post": (0.7, 1.1), "short": (0.1, 0.25), "hung": (0.02, 0.05)}[stands]
     top = p.uniform("height", low, most)
     parts = [
-        cone((0, top, 0), (0, top + size, 0), flare * wide * 0.85, wide * 0.85, colours.body),
-        cylinder((0, top - 0.02, 0), (0, top + 0.02, 0), flare * wide * 1.05, colours.trim),
-        cone((0, top + size, 0), (0, top + (1 + peak) * size, 0), eaves * wide, 0.15 * wide, colours.trim),
+        pillar((0, top, 0), top + size, flare * wide * 0.85, colours.body, wide * 0.85),
+        pillar((0, top - 0.02, 0), top + 0.02, flare * wide * 1.05, colours.trim),
+        pillar((0, top + size, 0), top + (1 + peak) * size, eaves * wide, colours.trim, 0.15 * wide),
         sphere((0, top + (1 + peak) * size + 0.01, 0), 0.035, colours.detail),
     ]
     rods = [
@@ -235,15 +233,13 @@ def _lantern(p: Parameters, colours: Palette, radius: float, tall: float, rod: f
     if stands != "hung":
         post, base = p.uniform("post_radius", 0.025, 0.045), p.uniform("base_radius", 0.07, 0.12)
         parts += [
-            cylinder((0, 0, 0), (0, top, 0), post, colours.trim),
-            cone((0, 0, 0), (0, 0.6 * min(top, 0.3), 0), base, post, colours.trim),
+            pillar((0, 0, 0), top, post, colours.trim),
+            pillar((0, 0, 0), 0.6 * min(top, 0.3), base, colours.trim, post),
         ]
-        parts.append(block((-base, 0, -base), (base, 0.03, base), colours.detail))
+        parts.append(slab((-base, 0), (base, 0.03), base, colours.detail))
     else:
         end = top + (1 + peak) * size
         chain = p.uniform("chain", 0.1, 0.4)
         parts += ring([(0, end, 0), (0, end + chain, 0)], 0.018, colours.detail)
-        parts.append(
-            cylinder((0, end + chain, 0), (0, end + chain + 0.03, 0), p.uniform("hook", 0.05, 0.1), colours.trim)
-        )
+        parts.append(pillar((0, end + chain, 0), end + chain + 0.03, p.uniform("hook", 0.05, 0.1), colours.trim))
     return parts

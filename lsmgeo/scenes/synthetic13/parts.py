@@ -10,13 +10,18 @@ import numpy as np
 from lsmgeo.scenes.solids import Kind, Material, Solid, box, cone, cylinder, half_space
 
 __all__ = [
+    "Pair",
+    "Point",
     "bar",
     "below",
     "block",
     "kept",
     "pair",
+    "pillar",
     "rack",
     "ring",
+    "rod",
+    "slab",
     "spaced",
     "spokes",
     "tube",
@@ -26,12 +31,32 @@ __all__ = [
 ]
 
 Vector = Sequence[float] | np.ndarray
+Pair = tuple[float, float]
+Point = tuple[float, float, float]
 
 
 def block(low: Vector, high: Vector, material: Material) -> Solid:
     """The box between two opposite corners."""
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     return box((low + high) / 2, high - low, material)
+
+
+def slab(low: Pair, high: Pair, half: float, material: Material) -> Solid:
+    """The box between two corners (x, y) that reaches ``half`` to either side of z = 0."""
+    return block((*low, -half), (*high, half), material)
+
+
+def pillar(foot: Point, top: float, radius: float, material: Material, top_radius: float | None = None) -> Solid:
+    """An upright cylinder from ``foot`` to y = ``top``, or a frustum."""
+    head = (foot[0], top, foot[2])
+    if top_radius is None:
+        return cylinder(foot, head, radius, material)
+    return cone(foot, head, radius, top_radius, material)
+
+
+def rod(start: Point, end: float, radius: float, material: Material) -> Solid:
+    """A cylinder along x from ``start`` to x = ``end``."""
+    return cylinder(start, (end, start[1], start[2]), radius, material)
 
 
 def bar(start: Vector, end: Vector, width: float, depth: float, material: Material) -> Solid:

@@ -13,7 +13,7 @@ import numpy as np
 
 from lsmgeo.scenes.solids import Solid, box, cone, cylinder, ellipsoid
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
-from lsmgeo.scenes.synthetic13.parts import bar, below, block, pair, rack, ring
+from lsmgeo.scenes.synthetic13.parts import bar, below, block, pair, pillar, rack, ring, rod, slab
 
 __all__ = ["build"]
 
@@ -26,8 +26,8 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     radius = p.uniform("barrel_radius", 0.013, 0.018)
     axis = 0.25 * height  # the barrel's height over the receiver's middle
     parts = [
-        block((0, -height / 2, -width / 2), (length, height / 2, width / 2), colours.trim),
-        cylinder((length - 0.02, axis, 0), (length + reach, axis, 0), radius, colours.dark),
+        slab((0, -height / 2), (length, height / 2), width / 2, colours.trim),
+        rod((length - 0.02, axis, 0), length + reach, radius, colours.dark),
         block((0.35 * length, -0.2 * height, 0), (0.7 * length, 0.3 * height, 0.65 * width), colours.dark),
     ]
     parts += _stock(p, stock, colours, height, width)
@@ -41,14 +41,14 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
 def _stock(p: Parameters, stock: str, colours: Palette, height: float, width: float) -> list[Solid]:
     """What goes to the shoulder, behind x = 0."""
     if stock == "none":
-        return [cylinder((-0.03, 0, 0), (0.01, 0, 0), 0.4 * height, colours.trim)]
+        return [rod((-0.03, 0, 0), 0.01, 0.4 * height, colours.trim)]
     long, drop, butt = (
         p.uniform("stock_length", 0.2, 0.34),
         p.uniform("stock_drop", 0.01, 0.08),
         p.uniform("butt_height", 0.09, 0.15),
     )
     low, up = -drop - butt / 2, -drop + butt / 2
-    pad = block((-long - 0.025, low, -0.55 * width), (-long, up, 0.55 * width), colours.dark)
+    pad = slab((-long - 0.025, low), (-long, up), 0.55 * width, colours.dark)
     if stock in ("wooden", "thumbhole"):
         body = _tapering(long, drop, butt, 0.8 * height, width, colours)
         if stock == "thumbhole":
@@ -56,8 +56,8 @@ def _stock(p: Parameters, stock: str, colours: Palette, height: float, width: fl
             return [body.minus(hole.scaled((2.0, 1.0, 1.0), (-0.3 * long, 0, 0))), pad]
         return [body, pad]
     if stock == "straight":
-        body = block((-long, -0.6 * height - 0.3 * drop, -width / 2), (0.0, 0.45 * height, width / 2), colours.body)
-        tube = cylinder((-long, 0.1 * height, 0), (0.02, 0.1 * height, 0), 0.5 * width, colours.trim)
+        body = slab((-long, -0.6 * height - 0.3 * drop), (0.0, 0.45 * height), width / 2, colours.body)
+        tube = rod((-long, 0.1 * height, 0), 0.02, 0.5 * width, colours.trim)
         return [below(body, (-long, 0.45 * height), (0.0, 0.25 * height)), tube, pad]
     if stock == "skeleton":
         rods = ring([(0, 0.2 * height, 0), (-long, min(up, 0.2 * height) - 0.015, 0)], 0.016, colours.body)
@@ -69,9 +69,9 @@ def _stock(p: Parameters, stock: str, colours: Palette, height: float, width: fl
 
 def _tapering(long: float, drop: float, butt: float, start: float, width: float, colours: Palette) -> Solid:
     """A stock as high as the receiver in front and as the butt behind."""
-    body = block((-long, -drop - butt / 2, -width / 2), (0.02, start / 2, width / 2), colours.body)
+    body = slab((-long, -drop - butt / 2), (0.02, start / 2), width / 2, colours.body)
     body = below(body, (-long, -drop + butt / 2), (0, start / 2)) if -drop + butt / 2 < start / 2 else body
-    under = block((-long * 1.2, -1, -1), (1, 0, 1), colours.body)
+    under = slab((-long * 1.2, -1), (1, 0), 1, colours.body)
     slope = (-drop - butt / 2 + start / 2) / -long
     wedge = under.transformed(np.array([[1, 0, 0, 0], [slope, 1, 0, -start / 2], [0, 0, 1, 0]]))
     return body.minus(wedge)
@@ -105,31 +105,29 @@ def _fore_end(
     long = p.uniform("fore_end_length", 0.4, 0.75) * reach
     end = length + long
     if form == "wood":
-        body = block((length - 0.01, -0.5 * height, -width / 2), (end, axis, width / 2), colours.body)
-        under = block((length - 0.2, -1, -1), (end + 1, 0, 1), colours.body)
+        body = slab((length - 0.01, -0.5 * height), (end, axis), width / 2, colours.body)
+        under = slab((length - 0.2, -1), (end + 1, 0), 1, colours.body)
         slope = 0.35 * height / long
         shear = np.array([[1, 0, 0, 0], [slope, 1, 0, -0.5 * height - slope * length], [0, 0, 1, 0]])
         return [body.minus(under.transformed(shear))]
     if form == "guard":
-        tube = cylinder((length - 0.01, axis, 0), (end, axis, 0), 0.55 * width + 0.006, colours.body)
+        tube = rod((length - 0.01, axis, 0), end, 0.55 * width + 0.006, colours.body)
         bands = rack(
             (length, axis - 0.7 * width, -0.7 * width), (end, axis + 0.7 * width, 0.7 * width), 0, 3, colours.dark, 0.25
         )
         return [tube, *bands]
     if form == "pump":
-        tube = cylinder((length - 0.01, axis - 0.042, 0), (length + 0.9 * reach, axis - 0.042, 0), 0.014, colours.dark)
-        grip = cylinder(
-            (length + 0.3 * long, axis - 0.042, 0), (length + 0.3 * long + 0.13, axis - 0.042, 0), 0.026, colours.body
-        )
+        tube = rod((length - 0.01, axis - 0.042, 0), length + 0.9 * reach, 0.014, colours.dark)
+        grip = rod((length + 0.3 * long, axis - 0.042, 0), length + 0.3 * long + 0.13, 0.026, colours.body)
         ringed = box((length + 0.88 * reach, axis - 0.02, 0), (0.026, 0.06, 0.03), colours.dark)
         return [tube, grip, ringed]
-    body = block((length - 0.01, axis - 0.035, -width / 2), (end, axis + 0.03, width / 2), colours.body)
+    body = slab((length - 0.01, axis - 0.035), (end, axis + 0.03), width / 2, colours.body)
     handle = p.choice("front_grip", ("none", "upright"))
     if handle == "none":
         return [body]
     return [
         body,
-        cylinder((length + 0.6 * long, axis - 0.12, 0), (length + 0.6 * long, axis - 0.02, 0), 0.018, colours.dark),
+        pillar((length + 0.6 * long, axis - 0.12, 0), axis - 0.02, 0.018, colours.dark),
     ]
 
 
@@ -153,7 +151,7 @@ def _magazine(p: Parameters, colours: Palette, length: float, height: float, wid
             (place + 0.75 * deep, low - 1.1 * deep),
         ]
         return [bar((*second, 0), (*first, 0), wide, 0.8 * width, colours.dark) for first, second in pairwise(bend)]
-    neck = block((place - 0.02, low - 0.03, -0.4 * width), (place + 0.02, low + 0.01, 0.4 * width), colours.dark)
+    neck = slab((place - 0.02, low - 0.03), (place + 0.02, low + 0.01), 0.4 * width, colours.dark)
     return [neck, cylinder((place, low - 0.06, -0.8 * width), (place, low - 0.06, 0.8 * width), 0.055, colours.dark)]
 
 
@@ -163,9 +161,7 @@ def _sight(
     """What one aims with, on top of the receiver."""
     form = p.choice("sight", ("none", "scope", "scope", "irons", "red dot", "handle"))
     top = height / 2
-    front = block(
-        (length + 0.9 * reach - 0.013, axis, -0.013), (length + 0.9 * reach + 0.013, axis + 0.05, 0.013), colours.dark
-    )
+    front = slab((length + 0.9 * reach - 0.013, axis), (length + 0.9 * reach + 0.013, axis + 0.05), 0.013, colours.dark)
     if form == "none":
         return []
     if form == "scope":
@@ -176,24 +172,24 @@ def _sight(
         )
         x = 0.5 * length - 0.4 * long
         rings = [
-            block((x + share * long - 0.013, top - 0.005, -0.013), (x + share * long + 0.013, up, 0.013), colours.trim)
+            slab((x + share * long - 0.013, top - 0.005), (x + share * long + 0.013, up), 0.013, colours.trim)
             for share in (0.3, 0.6)
         ]
         return [
-            cylinder((x, up, 0), (x + long, up, 0), size, colours.dark),
+            rod((x, up, 0), x + long, size, colours.dark),
             cone((x + 0.75 * long, up, 0), (x + long + 0.03, up, 0), size, 1.7 * size, colours.dark),
             cone((x - 0.02, up, 0), (x + 0.15 * long, up, 0), 1.4 * size, size, colours.dark),
-            cylinder((x + 0.48 * long, up, 0), (x + 0.48 * long, up + 1.9 * size, 0), 0.014, colours.dark),
+            pillar((x + 0.48 * long, up, 0), up + 1.9 * size, 0.014, colours.dark),
             *rings,
         ]
     if form == "irons":
-        rear = block((0.2 * length, top - 0.01, -0.018), (0.2 * length + 0.03, top + 0.03, 0.018), colours.dark)
+        rear = slab((0.2 * length, top - 0.01), (0.2 * length + 0.03, top + 0.03), 0.018, colours.dark)
         return [rear, front]
     if form == "red dot":
         x = 0.45 * length
         return [
-            block((x, top - 0.01, -0.018), (x + 0.07, top + 0.02, 0.018), colours.dark),
-            cylinder((x, top + 0.035, 0), (x + 0.07, top + 0.035, 0), 0.027, colours.dark),
+            slab((x, top - 0.01), (x + 0.07, top + 0.02), 0.018, colours.dark),
+            rod((x, top + 0.035, 0), x + 0.07, 0.027, colours.dark),
             front,
         ]
     rise = p.uniform("handle_height", 0.05, 0.08)
@@ -203,7 +199,7 @@ def _sight(
     ]
     return [
         *posts,
-        block((0.1 * length, top + rise - 0.026, -0.014), (0.8 * length, top + rise, 0.014), colours.trim),
+        slab((0.1 * length, top + rise - 0.026), (0.8 * length, top + rise), 0.014, colours.trim),
         front,
     ]
 
@@ -212,13 +208,13 @@ def _muzzle(p: Parameters, colours: Palette, end: float, axis: float, radius: fl
     form = p.choice("muzzle", ("plain", "brake", "suppressor", "bayonet"))
     parts = []
     if form == "brake":
-        parts.append(cylinder((end - 0.01, axis, 0), (end + 0.05, axis, 0), 1.5 * radius, colours.trim))
+        parts.append(rod((end - 0.01, axis, 0), end + 0.05, 1.5 * radius, colours.trim))
     elif form == "suppressor":
         long = p.uniform("suppressor_length", 0.12, 0.22)
-        parts.append(cylinder((end - 0.02, axis, 0), (end + long, axis, 0), 1.7 * radius, colours.trim))
+        parts.append(rod((end - 0.02, axis, 0), end + long, 1.7 * radius, colours.trim))
     elif form == "bayonet":
         blade = ellipsoid((end + 0.05, axis - 0.035, 0), (0.13, 0.016, 0.013), colours.detail)
-        parts += [blade, block((end - 0.06, axis - 0.045, -0.014), (end - 0.02, axis, 0.014), colours.dark)]
+        parts += [blade, slab((end - 0.06, axis - 0.045), (end - 0.02, axis), 0.014, colours.dark)]
     if p.choice("bipod", ("none", "none", "bipod")) == "bipod":
         drop, place = p.uniform("bipod_height", 0.12, 0.2), end - 0.12
         parts += pair(bar((place + 0.02, axis - drop, 0.4 * drop), (place, axis, 0.005), 0.026, 0.026, colours.dark))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from lsmgeo.scenes.solids import Solid, box, cylinder, ellipsoid
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
-from lsmgeo.scenes.synthetic13.parts import bar, below, block, pair, spaced, window
+from lsmgeo.scenes.synthetic13.parts import Pair, Point, bar, below, block, pair, pillar, rod, slab, spaced, window
 
 __all__ = ["build"]
 
@@ -32,7 +32,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     if plan == "round":
         parts = _round(p, support, colours, (lift, floor, height), rise, back, x, z)
     else:
-        parts = [block((-x, lift, -z), (x, floor, z), colours.body)]
+        parts = [slab((-x, lift), (x, floor), z, colours.body)]
         parts += [
             _pad((-x + back - 0.02, floor - 0.02, low), (x + 0.02, height, high), colours)
             for low, high in _pieces(-z, z, seats)
@@ -40,7 +40,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
         if plan != "daybed":
             parts += _back(p, colours, (lift, floor, height + rise), (x, z), back, seats)
         else:
-            bolster = cylinder((-x, height + 0.1, -z + 0.12), (x, height + 0.1, -z + 0.12), 0.14, colours.trim)
+            bolster = rod((-x, height + 0.1, -z + 0.12), x, 0.14, colours.trim)
             parts += [bolster, block((-x, lift, -z - 0.06), (x, height + 0.6 * rise, -z), colours.body)]
         parts += _arms(p, arms, plan, colours, (lift, height), (x, z), arm, back)
     if plan.startswith("corner"):
@@ -54,34 +54,27 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     return parts
 
 
-def _pieces(low: float, high: float, count: int) -> list[tuple[float, float]]:
+def _pieces(low: float, high: float, count: int) -> list[Pair]:
     """An interval in ``count`` pieces with seams between them."""
     step = (high - low) / count
     return [(low + index * step + 0.012, low + (index + 1) * step - 0.012) for index in range(count)]
 
 
-def _pad(low: tuple[float, float, float], high: tuple[float, float, float], colours: Palette) -> Solid:
+def _pad(low: Point, high: Point, colours: Palette) -> Solid:
     return block(low, high, colours.trim)
 
 
-def _back(
-    p: Parameters,
-    colours: Palette,
-    levels: tuple[float, float, float],
-    half: tuple[float, float],
-    thick: float,
-    seats: int,
-) -> list[Solid]:
+def _back(p: Parameters, colours: Palette, levels: Point, half: Pair, thick: float, seats: int) -> list[Solid]:
     """The back rest along the rear edge."""
     form = p.choice("back", ("block", "cushions", "roll", "camel", "rail"))
     (lift, floor, top), (x, z) = levels, half
     lean = p.uniform("back_lean", 2, 16)
     pivot = (-x, floor, 0)
-    wall = block((-x, lift, -z), (-x + thick, top, z), colours.body)
+    wall = slab((-x, lift), (-x + thick, top), z, colours.body)
     if form == "block":
         return [wall.rotated(2, lean / 3, pivot)]
     if form == "cushions":
-        low = block((-x, lift, -z), (-x + 0.45 * thick, top - 0.06, z), colours.body)
+        low = slab((-x, lift), (-x + 0.45 * thick, top - 0.06), z, colours.body)
         pads = [
             block((-x + 0.3 * thick, floor + 0.05, a), (-x + 1.2 * thick, top, b), colours.trim).rotated(2, lean, pivot)
             for a, b in _pieces(-z, z, seats)
@@ -90,14 +83,14 @@ def _back(
     if form == "roll":
         level = top - 0.5 * thick
         roll = cylinder((-x + 0.4 * thick, level, -z), (-x + 0.4 * thick, level, z), 0.55 * thick, colours.body)
-        return [block((-x, lift, -z), (-x + 0.8 * thick, level, z), colours.body), roll]
+        return [slab((-x, lift), (-x + 0.8 * thick, level), z, colours.body), roll]
     if form == "camel":
         hump = ellipsoid((-x + 0.5 * thick, top - 0.12, 0), (0.5 * thick, 0.24, 0.75 * z), colours.body)
-        return [block((-x, lift, -z), (-x + thick, top - 0.1, z), colours.body), hump]
+        return [slab((-x, lift), (-x + thick, top - 0.1), z, colours.body), hump]
     level = 0.6 * floor + 0.4 * top
     rails = [
-        block((-x, level - 0.06, -z), (-x + 0.07, level, z), colours.detail),
-        block((-x, top - 0.09, -z), (-x + 0.07, top, z), colours.detail),
+        slab((-x, level - 0.06), (-x + 0.07, level), z, colours.detail),
+        slab((-x, top - 0.09), (-x + 0.07, top), z, colours.detail),
     ]
     posts = [
         block((-x, lift, place - 0.04), (-x + 0.07, top, place + 0.04), colours.detail)
@@ -111,14 +104,7 @@ def _back(
 
 
 def _arms(
-    p: Parameters,
-    arms: str,
-    plan: str,
-    colours: Palette,
-    levels: tuple[float, float],
-    half: tuple[float, float],
-    width: float,
-    back: float,
+    p: Parameters, arms: str, plan: str, colours: Palette, levels: Pair, half: Pair, width: float, back: float
 ) -> list[Solid]:
     """Arm rests outside the seat; on a daybed none, where a corner sofa has its chaise one."""
     (lift, height), (x, z) = levels, half
@@ -133,9 +119,7 @@ def _arms(
         radius = 0.62 * width
         parts = [
             block((-x, lift, z - 0.01), (front, top - 0.5 * radius, z + 0.8 * width), colours.body),
-            cylinder(
-                (-x, top - radius, z + 0.5 * width), (front + 0.02, top - radius, z + 0.5 * width), radius, colours.body
-            ),
+            rod((-x, top - radius, z + 0.5 * width), front + 0.02, radius, colours.body),
         ]
     elif arms == "slanted":
         body = block((-x, lift, z - 0.01), (front, top + 0.25, z + width), colours.body)
@@ -152,14 +136,7 @@ def _arms(
     return pair(*parts)
 
 
-def _chaise(
-    p: Parameters,
-    colours: Palette,
-    side: int,
-    levels: tuple[float, float, float],
-    half: tuple[float, float],
-    piece: float,
-) -> list[Solid]:
+def _chaise(p: Parameters, colours: Palette, side: int, levels: Point, half: Pair, piece: float) -> list[Solid]:
     """The long seat at one end, towards +x, with or without a back of its own."""
     (lift, floor, height), (x, z) = levels, half
     reach, wide = p.uniform("chaise_length", 0.5, 1.3), 1.1 * piece
@@ -179,7 +156,7 @@ def _chaise(
 def _support(p: Parameters, support: str, colours: Palette, lift: float, x: float, z: float) -> list[Solid]:
     width = p.uniform("leg_width", 0.05, 0.1)
     if support == "plinth":
-        return [block((-x + 0.06, 0, -z + 0.06), (x - 0.06, lift + 0.01, z - 0.06), colours.detail)]
+        return [slab((-x + 0.06, 0), (x - 0.06, lift + 0.01), z - 0.06, colours.detail)]
     near, side = x - 0.12, z - 0.1
     if support == "legs":
         return pair(
@@ -192,14 +169,7 @@ def _support(p: Parameters, support: str, colours: Palette, lift: float, x: floa
 
 
 def _round(
-    p: Parameters,
-    support: str,
-    colours: Palette,
-    levels: tuple[float, float, float],
-    rise: float,
-    back: float,
-    x: float,
-    z: float,
+    p: Parameters, support: str, colours: Palette, levels: Point, rise: float, back: float, x: float, z: float
 ) -> list[Solid]:
     """A sofa in the round: an oval seat in a curved back that opens to the front."""
     lift, floor, height = levels
@@ -207,7 +177,7 @@ def _round(
     inner = max(1 - 0.9 * back / min(x, z), 0.5)
 
     def oval(low: float, high: float, share: float) -> Solid:
-        return cylinder((0, low, 0), (0, high, 0), share, colours.body).scaled((x, 1.0, z))
+        return pillar((0, low, 0), high, share, colours.body).scaled((x, 1.0, z))
 
     front = box((opening + 5, height + 5, 0), (10, 10, 10))
     shell = oval(lift, height + rise, 1.0).minus(oval(floor, height + 2 * rise, inner), front)
@@ -216,10 +186,7 @@ def _round(
     if support == "plinth":
         parts.append(oval(0, lift + 0.01, 1 - size).painted(colours.detail))
     else:
-        legs = (
-            cylinder((s * 0.55 * x, 0, 0.55 * z), (s * 0.55 * x, lift + 0.02, 0.55 * z), size / 2, colours.detail)
-            for s in (-1, 1)
-        )
+        legs = (pillar((s * 0.55 * x, 0, 0.55 * z), lift + 0.02, size / 2, colours.detail) for s in (-1, 1))
         parts += pair(*legs)
     reach = min(0.5 * rise, 0.3)
     pads = (

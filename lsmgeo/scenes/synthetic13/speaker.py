@@ -11,7 +11,21 @@ import numpy as np
 
 from lsmgeo.scenes.solids import Solid, box, cone, cylinder, ellipsoid, half_space, sphere
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
-from lsmgeo.scenes.synthetic13.parts import bar, below, block, kept, pair, ring, spaced, spokes, tube
+from lsmgeo.scenes.synthetic13.parts import (
+    Point,
+    bar,
+    below,
+    block,
+    kept,
+    pair,
+    pillar,
+    ring,
+    rod,
+    slab,
+    spaced,
+    spokes,
+    tube,
+)
 
 __all__ = ["build"]
 
@@ -48,7 +62,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     shape = p.choice(
         "shape", ("square", "sloped", "tapered") if kind in ("bookshelf", "tower", "stage box") else ("square",)
     )
-    body = block((-x, 0, -z), (x, tall, z), colours.body)
+    body = slab((-x, 0), (x, tall), z, colours.body)
     if shape == "sloped":
         body = below(body, (-x, p.uniform("slope", 0.7, 0.9) * tall), (x, tall))
     elif shape == "tapered":
@@ -62,7 +76,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
         for place in np.linspace(-z + 0.15, z - 0.15, count):
             parts += _driver(rim, colours, (x, tall / 2, float(place)), size, dish, proud)
         strip = p.uniform("strip", 0.5, 0.9)
-        parts.append(block((-0.9 * x, tall - 0.01, -strip * z), (0.9 * x, tall + 0.015, strip * z), colours.trim))
+        parts.append(slab((-0.9 * x, tall - 0.01), (0.9 * x, tall + 0.015), strip * z, colours.trim))
         parts += pair(block((-x, -lift, z - 0.1), (x, 0.02, z - 0.06), colours.trim))
         return parts
     drivers = {"tower": ("two", "three", "four"), "subwoofer": ("one",)}.get(kind, ("one", "two", "two"))
@@ -83,7 +97,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     for share, size in places:
         parts += _driver(rim, colours, (front if shape == "square" else x, share * tall, 0), size, dish, proud)
     if kind == "bookshelf" and p.choice("port", ("none", "slot")) == "slot":
-        slot = block((x - 0.15, 0.03, -0.6 * z), (x + 0.1, 0.08, 0.6 * z), colours.dark)
+        slot = slab((x - 0.15, 0.03), (x + 0.1, 0.08), 0.6 * z, colours.dark)
         parts = (
             [part.minus(slot) for part in parts[:2]] + parts[2:]
             if shape == "square"
@@ -94,19 +108,17 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     return parts + _foot(p, foot, colours, x, z)
 
 
-def _driver(
-    rim: str, colours: Palette, at: tuple[float, float, float], radius: float, dish: float, proud: float
-) -> list[Solid]:
+def _driver(rim: str, colours: Palette, at: Point, radius: float, dish: float, proud: float) -> list[Solid]:
     """A dished membrane with a dome in its middle, and what frames it, on a front at ``at``."""
     x, y, z = at
     cup = cone((x + 2 * proud, y, z), (x - dish * radius, y, z), 0.95 * radius, 0.2 * radius)
     parts = [
-        cylinder((x - 0.9 * radius * dish, y, z), (x + proud, y, z), radius, colours.dark).minus(cup),
+        rod((x - 0.9 * radius * dish, y, z), x + proud, radius, colours.dark).minus(cup),
         sphere((x - 0.5 * dish * radius, y, z), 0.33 * radius, colours.detail),
     ]
     if rim == "ring":
         hole = cylinder((x - 1, y, z), (x + 1, y, z), 0.92 * radius)
-        parts.append(cylinder((x - 0.01, y, z), (x + 1.2 * proud, y, z), 1.15 * radius, colours.trim).minus(hole))
+        parts.append(rod((x - 0.01, y, z), x + 1.2 * proud, 1.15 * radius, colours.trim).minus(hole))
     elif rim == "square":
         hole = cylinder((x - 1, y, z), (x + 1, y, z), 0.98 * radius)
         parts.append(box((x + 0.3 * proud, y, z), (proud, 2.15 * radius, 2.15 * radius), colours.trim).minus(hole))
@@ -119,21 +131,16 @@ def _foot(p: Parameters, foot: str, colours: Palette, x: float, z: float) -> lis
         return []
     drop = p.uniform("foot_height", 0.03, 0.1)
     if foot == "feet":
-        return pair(
-            *(
-                cone((s * 0.75 * x, 0.02, 0.75 * z), (s * 0.75 * x, -drop, 0.75 * z), 0.04, 0.02, colours.detail)
-                for s in (-1, 1)
-            )
-        )
+        return pair(*(pillar((s * 0.75 * x, 0.02, 0.75 * z), -drop, 0.04, colours.detail, 0.02) for s in (-1, 1)))
     if foot == "plinth":
-        return [block((-1.15 * x, -0.6 * drop, -1.2 * z), (1.15 * x, 0.01, 1.2 * z), colours.trim)]
+        return [slab((-1.15 * x, -0.6 * drop), (1.15 * x, 0.01), 1.2 * z, colours.trim)]
     pole, radius = p.uniform("pole_height", 0.5, 1.0), p.uniform("pole_radius", 0.025, 0.05)
-    post = cylinder((0, -pole, 0), (0, 0.05, 0), radius, colours.detail)
+    post = pillar((0, -pole, 0), 0.05, radius, colours.detail)
     if foot == "stand":
         return [
             post,
-            block((-x, -pole, -z), (x, -pole + 0.04, z), colours.detail),
-            block((-0.8 * x, -0.03, -0.8 * z), (0.8 * x, 0.01, 0.8 * z), colours.detail),
+            slab((-x, -pole), (x, -pole + 0.04), z, colours.detail),
+            slab((-0.8 * x, -0.03), (0.8 * x, 0.01), 0.8 * z, colours.detail),
         ]
     return [post, *spokes((0, -0.45 * pole, 0), 0.55 * pole, 0.55 * pole, 3, 0.045, colours.detail)]
 
@@ -142,8 +149,8 @@ def _cylinder(p: Parameters, rim: str, colours: Palette) -> list[Solid]:
     tall, radius = p.uniform("height", 0.4, 1.1), p.uniform("radius", 0.16, 0.3)
     narrow, band = p.uniform("taper", 0.6, 1.0), p.uniform("band", 0.08, 0.18)
     style = p.choice("style", ("drivers", "bands", "dome"))
-    parts = [cone((0, 0, 0), (0, tall, 0), radius, narrow * radius, colours.body)]
-    parts.append(cylinder((0, 0, 0), (0, band * tall, 0), p.uniform("flare", 1.04, 1.25) * radius, colours.trim))
+    parts = [pillar((0, 0, 0), tall, radius, colours.body, narrow * radius)]
+    parts.append(pillar((0, 0, 0), band * tall, p.uniform("flare", 1.04, 1.25) * radius, colours.trim))
     top = narrow * radius
     if style == "drivers":
         size = p.uniform("woofer", 0.45, 0.62) * min(top, 0.25 * tall)
@@ -158,7 +165,7 @@ def _cylinder(p: Parameters, rim: str, colours: Palette) -> list[Solid]:
         for y in first:
             end = y + share * (high - low) / 4 if style == "bands" else high
             wide = [1.04 * (radius + (top - radius) * level) for level in (y, end)]
-            parts.append(cone((0, y * tall, 0), (0, end * tall, 0), wide[0], wide[1], colours.dark))
+            parts.append(pillar((0, y * tall, 0), end * tall, wide[0], colours.dark, wide[1]))
     cap = (0.5 if style == "dome" else 0.0) + p.uniform("cap", 0.08, 0.25)
     return [*parts, ellipsoid((0, tall, 0), (0.9 * top, cap * top, 0.9 * top), colours.dark)]
 
@@ -175,12 +182,12 @@ def _ball(p: Parameters, rim: str, colours: Palette, dish: float, proud: float) 
     bottom = -flat * radius
     rise = p.uniform("rise", 0.1, 0.7)
     if foot == "ring":
-        return [*parts, cone((0, bottom - 0.15 * rise, 0), (0, 0.6 * bottom, 0), spread, 0.5 * radius, colours.trim)]
+        return [*parts, pillar((0, bottom - 0.15 * rise, 0), 0.6 * bottom, spread, colours.trim, 0.5 * radius)]
     if foot == "tripod":
         return [*parts, *spokes((0, 0.6 * bottom, 0), spread, rise - 0.4 * bottom, 3, 0.05, colours.trim)]
     low = bottom - rise
-    post = cylinder((0, low, 0), (0, 0, 0), 0.04, colours.trim)
-    return [*parts, post, cone((0, low, 0), (0, low + 0.08, 0), spread, 0.1, colours.trim)]
+    post = pillar((0, low, 0), 0, 0.04, colours.trim)
+    return [*parts, post, pillar((0, low, 0), low + 0.08, spread, colours.trim, 0.1)]
 
 
 def _horn(p: Parameters, colours: Palette) -> list[Solid]:
@@ -193,14 +200,14 @@ def _horn(p: Parameters, colours: Palette) -> list[Solid]:
     horn = [
         tube((0, 0, 0), (length, 0, 0), throat, mouth * flare, 0.035, colours.body),
         tube((0.93 * length, 0, 0), (lip * length, 0, 0), mouth * (flare - 0.06), mouth, 0.035, colours.body),
-        cylinder((-0.08, 0, 0), (0.05, 0, 0), throat, colours.trim),
+        rod((-0.08, 0, 0), 0.05, throat, colours.trim),
     ]
     if style == "gramophone":
         at = np.array([-0.15, tall + 0.3, 0])
         horn = [part.rotated(2, tilt).moved(at) for part in horn]
         neck = ring([(-0.12, tall - 0.02, 0), (-0.2, tall + 0.15, 0), at], 0.045, colours.trim)
-        disc = cylinder((0.05, tall - 0.01, 0), (0.05, tall + 0.03, 0), 0.4 * wide, colours.dark)
-        plinth = block((-wide / 2 - 0.03, 0, -wide / 2 - 0.03), (wide / 2 + 0.03, 0.05, wide / 2 + 0.03), colours.trim)
+        disc = pillar((0.05, tall - 0.01, 0), tall + 0.03, 0.4 * wide, colours.dark)
+        plinth = slab((-wide / 2 - 0.03, 0), (wide / 2 + 0.03, 0.05), wide / 2 + 0.03, colours.trim)
         crank = ring(
             [(0, tall / 2, wide / 2), (0, tall / 2, wide / 2 + 0.1), (0, tall / 2 - 0.12, wide / 2 + 0.1)],
             0.02,
@@ -212,11 +219,11 @@ def _horn(p: Parameters, colours: Palette) -> list[Solid]:
             disc,
             plinth,
             *crank,
-            block((-wide / 2, 0, -wide / 2), (wide / 2, tall, wide / 2), colours.trim),
+            slab((-wide / 2, 0), (wide / 2, tall), wide / 2, colours.trim),
         ]
-    driver = cylinder((-0.2, 0, 0), (-0.05, 0, 0), 1.8 * throat, colours.dark)
+    driver = rod((-0.2, 0, 0), -0.05, 1.8 * throat, colours.dark)
     parts = [part.rotated(2, 0.5 * tilt) for part in (*horn, driver)]
-    post = cylinder((0, -0.5 - tall, 0), (0, 0, 0), 0.04, colours.detail)
+    post = pillar((0, -0.5 - tall, 0), 0, 0.04, colours.detail)
     return [*parts, post, box((0, -0.5 - tall, 0), (wide, 0.04, wide), colours.detail)]
 
 
@@ -232,17 +239,12 @@ def _radio(p: Parameters, rim: str, colours: Palette, dish: float, proud: float)
         (0, tall - 0.03, -0.75 * z),
     ]
     left = _driver(rim, colours, (x, 0.45 * tall, z - 1.25 * size), size, dish, proud)
-    panel = block(
-        (x - 0.02, 0.2 * tall, -0.25 * wide + 0.05),
-        (x + 0.02, p.uniform("panel", 0.5, 0.7) * tall, 0.25 * wide - 0.05),
-        colours.detail,
+    panel = slab(
+        (x - 0.02, 0.2 * tall), (x + 0.02, p.uniform("panel", 0.5, 0.7) * tall), 0.25 * wide - 0.05, colours.detail
     )
-    parts = [block((-x, 0, -z), (x, tall, z), colours.body), *pair(*left), panel, *ring(handle, 0.025, colours.trim)]
+    parts = [slab((-x, 0), (x, tall), z, colours.body), *pair(*left), panel, *ring(handle, 0.025, colours.trim)]
     knob = p.uniform("knob", 0.025, 0.045)
-    parts += [
-        cylinder((x - 0.02, 0.85 * tall, place), (x + 0.04, 0.85 * tall, place), knob, colours.trim)
-        for place in (-0.1, 0.0, 0.1)
-    ]
+    parts += [rod((x - 0.02, 0.85 * tall, place), x + 0.04, knob, colours.trim) for place in (-0.1, 0.0, 0.1)]
     if p.choice("antenna", ("up", "none")) == "up":
         parts.append(
             cylinder((-0.5 * x, tall - 0.02, -0.8 * z), (-0.5 * x, tall + 0.5, -1.0 * z), 0.018, colours.detail)
@@ -262,12 +264,12 @@ def _stack(p: Parameters, colours: Palette) -> list[Solid]:
         cell = [
             box((0, -tall / 2, 0), (deep, 0.97 * tall, wide), colours.body),
             box((deep / 2, -tall / 2, 0), (0.03, 0.75 * tall, (1 - inset) * wide), colours.dark),
-            cylinder((deep / 2, -tall / 2, 0), (deep / 2 + 0.03, -tall / 2, 0), horn * tall, colours.trim),
+            rod((deep / 2, -tall / 2, 0), deep / 2 + 0.03, horn * tall, colours.trim),
         ]
         parts += [part.rotated(2, -angle).moved((x, y, 0)) for part in cell]
         y -= 0.97 * tall * np.cos(np.deg2rad(angle))
         x -= 0.97 * tall * np.sin(np.deg2rad(angle))
         angle += bend
-    frame = block((-deep / 2, -0.02, -wide / 2), (deep / 2, 0.04, wide / 2), colours.trim)
+    frame = slab((-deep / 2, -0.02), (deep / 2, 0.04), wide / 2, colours.trim)
     hooks = [bar((s * 0.4 * deep, 0, 0.4 * wide), (0, hook, 0.05), 0.03, 0.03, colours.trim) for s in (-1, 1)]
     return [*parts, frame, *pair(*hooks)]

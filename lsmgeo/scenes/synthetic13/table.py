@@ -7,9 +7,9 @@ what is below the top (nothing, apron, shelf, drawer, stretcher), a taper.
 
 from __future__ import annotations
 
-from lsmgeo.scenes.solids import Solid, box, cone, cylinder, half_space, sphere
+from lsmgeo.scenes.solids import Solid, box, cone, half_space, sphere
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
-from lsmgeo.scenes.synthetic13.parts import bar, block, pair, spokes, window
+from lsmgeo.scenes.synthetic13.parts import bar, block, pair, pillar, slab, spokes, window
 
 __all__ = ["build"]
 
@@ -53,11 +53,11 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
 
 def _top(top: str, colours: Palette, floor: float, height: float, x: float, z: float) -> list[Solid]:
     if top == "rectangular":
-        return [block((-x, floor, -z), (x, height, z), colours.body)]
+        return [slab((-x, floor), (x, height), z, colours.body)]
     if top == "clipped":
         corners = (half_space((0.6 * x, 0, s * z), (-z, 0, -s * x)) for s in (-1, 1))
-        return [block((-x, floor, -z), (x, height, z), colours.body).minus(*corners)]
-    return [cylinder((0, floor, 0), (0, height, 0), 1.0, colours.body).scaled((x, 1, z))]
+        return [slab((-x, floor), (x, height), z, colours.body).minus(*corners)]
+    return [pillar((0, floor, 0), height, 1.0, colours.body).scaled((x, 1, z))]
 
 
 def _base(
@@ -79,14 +79,14 @@ def _base(
         )
     if base in ("column", "star"):
         post, reach = p.uniform("column_radius", 0.035, 0.1), p.uniform("foot_reach", 0.5, 0.85) * min(near, side)
-        column = cylinder((0, 0.02, 0), (0, up, 0), post, material)
-        collar = cone((0, floor - 0.1, 0), (0, up, 0), post, min(2.5 * post, 0.9 * near), colours.detail)
+        column = pillar((0, 0.02, 0), up, post, material)
+        collar = pillar((0, floor - 0.1, 0), up, post, colours.detail, min(2.5 * post, 0.9 * near))
         if base == "column":
             return [
                 column,
                 collar,
-                cylinder((0, 0, 0), (0, 0.05, 0), reach + post, material),
-                cone((0, 0.04, 0), (0, 0.2 * floor, 0), 0.6 * reach + post, post, material),
+                pillar((0, 0, 0), 0.05, reach + post, material),
+                pillar((0, 0.04, 0), 0.2 * floor, 0.6 * reach + post, material, post),
             ]
         return [
             column,
@@ -127,7 +127,7 @@ def _base(
         wide, waist = p.uniform("drum_radius", 0.5, 0.9), p.uniform("drum_taper", 0.4, 1.0)
         scale = (wide * near, 1.0, wide * side)
         start, end = (0.0, up) if p.choice("taper", ("up", "down")) == "up" else (up, 0.0)
-        return [cone((0, start, 0), (0, end, 0), 1.0, waist, material).scaled(scale)]
+        return [pillar((0, start, 0), end, 1.0, material, waist).scaled(scale)]
     # A desk: drawers under one or both ends.
     under = p.choice("pedestals", ("both", "left", "right"))
     wide, lift = p.uniform("pedestal_width", 0.25, 0.42) * side, p.uniform("pedestal_clearance", 0.0, 0.12)
@@ -162,30 +162,20 @@ def _below(
 ) -> list[Solid]:
     """What joins the legs."""
     if base == "desk":
-        return [block((-near, floor - 0.35 * floor, -side), (-near + 0.035, floor + 0.01, side), colours.detail)]
+        return [slab((-near, floor - 0.35 * floor), (-near + 0.035, floor + 0.01), side, colours.detail)]
     form = p.choice("below", ("nothing", "apron", "shelf", "drawer", "stretcher"))
     drop = p.uniform("apron", 0.06, 0.16) if form in ("apron", "drawer") else 0.0
     if form == "apron":
         return window((-near, floor - drop, -side), (near, floor + 0.01, side), 1, 0.04, colours.detail)
     if form == "shelf" and base == "four legs":
         level = p.uniform("shelf_height", 0.15, 0.5) * floor
-        return [
-            block(
-                (-near - width / 4, level, -side - width / 4),
-                (near + width / 4, level + 0.045, side + width / 4),
-                colours.body,
-            )
-        ]
+        return [slab((-near - width / 4, level), (near + width / 4, level + 0.045), side + width / 4, colours.body)]
     if form == "drawer":
         wide = p.uniform("drawer_width", 0.4, 0.9) * side
-        case = block((-near, floor - drop, -wide), (near, floor + 0.01, wide), colours.trim)
+        case = slab((-near, floor - drop), (near, floor + 0.01), wide, colours.trim)
         return [
             case,
-            block(
-                (near - 0.01, floor - drop + 0.015, -0.92 * wide),
-                (near + 0.02, floor - 0.01, 0.92 * wide),
-                colours.body,
-            ),
+            slab((near - 0.01, floor - drop + 0.015), (near + 0.02, floor - 0.01), 0.92 * wide, colours.body),
             sphere((near + 0.03, floor - drop / 2, 0), 0.025, colours.detail),
         ]
     if form == "stretcher" and base == "four legs":

@@ -10,7 +10,7 @@ import numpy as np
 
 from lsmgeo.scenes.solids import Solid, box, cylinder, ellipsoid
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
-from lsmgeo.scenes.synthetic13.parts import below, block, pair, ring, spaced
+from lsmgeo.scenes.synthetic13.parts import Pair, below, block, pair, pillar, ring, rod, slab, spaced
 
 __all__ = ["build"]
 
@@ -39,12 +39,12 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
 
     if kind == "smartphone":
         chin, top = p.uniform("chin", 0.05, 0.14), p.uniform("forehead", 0.04, 0.12)
-        parts.append(block((x - 0.02, chin, -z + margin), (x + 0.012, tall - top, z - margin), colours.dark))
+        parts.append(slab((x - 0.02, chin), (x + 0.012, tall - top), z - margin, colours.dark))
         parts += _marks(p, colours, x, chin, tall - top / 2)
         lens = p.uniform("lens", 0.05, 0.09)
         level = p.uniform("switch_height", 0.5, 0.7) * tall
         parts += [
-            cylinder((-x - 0.03, tall - 0.12, z - 0.12), (-x + 0.01, tall - 0.12, z - 0.12), lens * 0.6, colours.dark),
+            rod((-x - 0.03, tall - 0.12, z - 0.12), -x + 0.01, lens * 0.6, colours.dark),
             box((-x - 0.01, tall - 0.14, z - 0.14), (0.03, 0.2, 0.18), colours.trim),
             block((0, level, z - 0.01), (0.03, level + 0.14, z + 0.02), colours.detail),
         ]
@@ -56,27 +56,27 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
         parts += _keys(p, keys, colours, x, (margin, low - 0.04 * tall), half, (3, 6))
         return [
             *parts,
-            *pair(cylinder((x - 0.01, level, 0.8 * z), (x + 0.03, level, 0.8 * z), disc * tall, colours.trim)),
+            *pair(rod((x - 0.01, level, 0.8 * z), x + 0.03, disc * tall, colours.trim)),
         ]
     if kind == "slider":
         slide, chin = p.uniform("slide", 0.25, 0.5), p.uniform("chin", 0.14, 0.26)
         button = p.uniform("button", 0.3, 0.45) * chin
         lower = [part.moved((-2 * x + 0.005, -slide, 0)) for part in _slab(colours, ends, x, tall, z)]
-        face = block((x - 0.02, chin, -z + margin), (x + 0.012, tall - margin, z - margin), colours.dark)
+        face = slab((x - 0.02, chin), (x + 0.012, tall - margin), z - margin, colours.dark)
         parts += [part.painted(colours.trim) for part in lower]
-        parts += [face, cylinder((x - 0.02, chin / 2, 0), (x + 0.02, chin / 2, 0), button, colours.detail)]
+        parts += [face, rod((x - 0.02, chin / 2, 0), x + 0.02, button, colours.detail)]
         return parts + _keys(p, keys, colours, -x, (-slide + 0.04, -0.03), (-z + margin, z - margin), (3, 3))
     split = (1 - p.uniform("screen_share", 0.25, 0.45)) * tall
-    parts.append(block((x - 0.02, split, -z + margin), (x + 0.012, tall - 2 * margin, z - margin), colours.dark))
+    parts.append(slab((x - 0.02, split), (x + 0.012, tall - 2 * margin), z - margin, colours.dark))
     parts += _keys(p, keys, colours, x, (margin + 0.02, 0.78 * split), (-z + margin, z - margin), (4, 3))
     pad, ear = p.uniform("pad_width", 0.18, 0.38) * wide, p.uniform("earpiece", 0.08, 0.16)
     parts.append(ellipsoid((x, 0.88 * split, 0), (0.03, 0.07 * split + 0.01, pad), colours.trim))
-    parts.append(block((x - 0.01, tall - 1.4 * margin, -ear), (x + 0.012, tall - 0.8 * margin, ear), colours.detail))
+    parts.append(slab((x - 0.01, tall - 1.4 * margin), (x + 0.012, tall - 0.8 * margin), ear, colours.detail))
     antenna = p.choice("antenna", ("none", "stub", "whip")) if kind != "brick" else "whip"
     if antenna != "none":
         long = p.uniform("antenna_length", 0.25, 0.6) if antenna == "whip" else p.uniform("antenna_length", 0.08, 0.16)
         size = 0.03 if antenna == "whip" else 0.05
-        parts.append(cylinder((0, tall - 0.05, z - 0.08), (0, tall + long, z - 0.08), min(size, x), colours.dark))
+        parts.append(pillar((0, tall - 0.05, z - 0.08), tall + long, min(size, x), colours.dark))
     if kind == "cordless":
         parts += _cradle(p, colours, x, z)
     return parts
@@ -85,23 +85,14 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
 def _slab(colours: Palette, ends: str, x: float, tall: float, z: float) -> list[Solid]:
     """An upright slab from y = 0, with square or half-oval ends."""
     if ends == "square":
-        return [block((-x, 0, -z), (x, tall, z), colours.body)]
+        return [slab((-x, 0), (x, tall), z, colours.body)]
     end = 0.35 * min(z, tall)
-    caps = [
-        cylinder((-x, 0, 0), (x, 0, 0), 1.0, colours.body).scaled((1, end, z)).moved((0, y, 0))
-        for y in (end, tall - end)
-    ]
-    return [block((-x, end, -z), (x, tall - end, z), colours.body), *caps]
+    caps = [rod((-x, 0, 0), x, 1.0, colours.body).scaled((1, end, z)).moved((0, y, 0)) for y in (end, tall - end)]
+    return [slab((-x, end), (x, tall - end), z, colours.body), *caps]
 
 
 def _keys(
-    p: Parameters,
-    keys: str,
-    colours: Palette,
-    x: float,
-    rows: tuple[float, float],
-    columns: tuple[float, float],
-    count: tuple[int, int],
+    p: Parameters, keys: str, colours: Palette, x: float, rows: Pair, columns: Pair, count: tuple[int, int]
 ) -> list[Solid]:
     """Keys in rows from low to high and columns along z, on a face at ``x``."""
     proud, fill = p.uniform("key_height", 0.015, 0.035), p.uniform("key_size", 0.55, 0.8)
@@ -113,9 +104,7 @@ def _keys(
             continue
         for z in spaced(*columns, count[1]):
             if keys == "round":
-                parts.append(
-                    cylinder((x - 0.02, y, z), (x + proud, y, z), 0.5 * fill * min(tall, wide), colours.detail)
-                )
+                parts.append(rod((x - 0.02, y, z), x + proud, 0.5 * fill * min(tall, wide), colours.detail))
             else:
                 parts.append(box((x, y, z), (2 * proud, fill * tall, fill * wide), colours.detail))
     return parts
@@ -125,7 +114,7 @@ def _marks(p: Parameters, colours: Palette, x: float, chin: float, top: float) -
     """A smartphone's button and ear piece."""
     size = p.uniform("button", 0.3, 0.42) * chin
     return [
-        cylinder((x - 0.02, chin / 2, 0), (x + 0.014, chin / 2, 0), size, colours.detail),
+        rod((x - 0.02, chin / 2, 0), x + 0.014, size, colours.detail),
         box((x, top, 0), (0.026, 0.026, 0.14), colours.detail),
     ]
 
@@ -137,13 +126,13 @@ def _flip(p: Parameters, keys: str, colours: Palette) -> list[Solid]:
     opening, margin = p.uniform("opening", 15, 95), p.uniform("margin", 0.03, 0.07)
     z, x = wide / 2, thick / 2
     lower = [
-        block((-thick, -low, -z), (0, 0, z), colours.body),
+        slab((-thick, -low), (0, 0), z, colours.body),
         *_keys(p, keys, colours, 0.0, (-low + margin, -0.32 * low), (-z + margin, z - margin), (3, 3)),
     ]
     lower.append(ellipsoid((0, -0.18 * low, 0), (0.03, 0.08 * low + 0.01, 0.3 * wide), colours.trim))
     upper = [
-        block((-thick, 0, -z), (0, up, z), colours.body),
-        block((-0.02, 0.15 * up, -z + margin), (0.012, up - margin, z - margin), colours.dark),
+        slab((-thick, 0), (0, up), z, colours.body),
+        slab((-0.02, 0.15 * up), (0.012, up - margin), z - margin, colours.dark),
     ]
     hinge = cylinder((-x, 0, -z), (-x, 0, z), 0.7 * thick, colours.trim)
     lean = 0.5 * opening
@@ -159,7 +148,7 @@ def _flip(p: Parameters, keys: str, colours: Palette) -> list[Solid]:
 def _cradle(p: Parameters, colours: Palette, x: float, z: float) -> list[Solid]:
     """The charging stand of a cordless telephone."""
     reach, rise = p.uniform("cradle_reach", 0.06, 0.18), p.uniform("cradle_height", 0.12, 0.24)
-    body = block((-x - reach, -0.06, -z - 0.1), (x + reach, rise, z + 0.1), colours.trim)
+    body = slab((-x - reach, -0.06), (x + reach, rise), z + 0.1, colours.trim)
     return [below(body, (-x - 0.2 * reach, rise), (x + reach, 0.5 * rise))]
 
 
@@ -174,13 +163,10 @@ def _with_handset(p: Parameters, kind: str, keys: str, colours: Palette) -> list
     long = 0.92 * wide if kind != "desk" else 0.95 * deep
     handset = [
         *ring([(0, 0, -long / 2), (0, 0.06, -0.3 * long), (0, 0.06, 0.3 * long), (0, 0, long / 2)], grip, colours.trim),
-        *(
-            cylinder((0, -0.09, s * (long / 2 - cup / 2)), (0, 0.03, s * (long / 2 - cup / 2)), cup, colours.trim)
-            for s in (-1, 1)
-        ),
+        *(pillar((0, -0.09, s * (long / 2 - cup / 2)), 0.03, cup, colours.trim) for s in (-1, 1)),
     ]
-    body = below(block((-x, 0, -z), (x, high, z), colours.body), (-x, high), (x, low))
-    parts = [body, block((-x - 0.03, 0, -z - 0.03), (x + 0.03, 0.04, z + 0.03), colours.trim)]
+    body = below(slab((-x, 0), (x, high), z, colours.body), (-x, high), (x, low))
+    parts = [body, slab((-x - 0.03, 0), (x + 0.03, 0.04), z + 0.03, colours.trim)]
 
     # What lies on the slope is made for a face at x = 0 that runs up along y, and laid down.
     def laid(solids: list[Solid]) -> list[Solid]:
@@ -203,8 +189,8 @@ def _with_handset(p: Parameters, kind: str, keys: str, colours: Palette) -> list
         return parts + ring(cord, 0.02, colours.dark)
     size = (p.uniform("dial", 0.28, 0.36) if kind == "rotary" else 0.34) * min(run, wide)
     dial = [
-        cylinder((-0.05, 0.42 * run, 0), (0.04, 0.42 * run, 0), size, colours.detail),
-        cylinder((0, 0.42 * run, 0), (0.065, 0.42 * run, 0), 0.42 * size, colours.body),
+        rod((-0.05, 0.42 * run, 0), 0.04, size, colours.detail),
+        rod((0, 0.42 * run, 0), 0.065, 0.42 * size, colours.body),
     ]
     angles = np.deg2rad(np.linspace(-30, 240, 8))
     dial += [

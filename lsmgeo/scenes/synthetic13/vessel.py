@@ -13,7 +13,7 @@ import numpy as np
 
 from lsmgeo.scenes.solids import Solid, box, cone, cylinder, ellipsoid, half_space
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
-from lsmgeo.scenes.synthetic13.parts import bar, below, block, kept, pair, ring, spaced, wing
+from lsmgeo.scenes.synthetic13.parts import bar, below, block, kept, pair, pillar, ring, rod, slab, spaced, wing
 
 __all__ = ["build"]
 
@@ -46,9 +46,9 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
         apart = p.uniform("hull_distance", 0.14, 0.24)
         hulls = [part.moved((0, 0, apart)) for part in hull]
         hulls += [part.moved((0, 0, -apart)) for part in hull]
-        deck = block((-0.4, -0.02, -apart - z), (0.12, 0.025, apart + z), colours.trim)
+        deck = slab((-0.4, -0.02), (0.12, 0.025), apart + z, colours.trim)
         cabin = below(
-            block((-0.3, 0, -0.7 * apart), (0.1, p.uniform("cabin_height", 0.08, 0.14), 0.7 * apart), colours.trim),
+            slab((-0.3, 0), (0.1, p.uniform("cabin_height", 0.08, 0.14)), 0.7 * apart, colours.trim),
             (-0.05, 0.15),
             (0.12, 0.0),
         )
@@ -94,16 +94,16 @@ def _hull(p: Parameters, bow: str, colours: Palette, beam: float, draught: float
     if bow == "round":
         full, deep = p.uniform("stern_width", 0.6, 0.85), p.uniform("stern_depth", 0.5, 0.75)
         low = ellipsoid((0, 0, 0), (0.5, draught, z), colours.body).minus(half_space((0, 0, 0), (0, -1, 0)))
-        stern = cylinder((-0.45, -deep * draught, 0), (0, -deep * draught, 0), 1.0, colours.body)
+        stern = rod((-0.45, -deep * draught, 0), 0, 1.0, colours.body)
         stern = stern.scaled((1, deep * draught, full * z), (0, -deep * draught, 0))
         return [low, stern, ellipsoid((0, 0, 0), (0.5, 0.03, z), colours.trim)]
     start, rake = p.uniform("bow_start", 0.1, 0.3), p.uniform("bow_rake", 0.02, 0.15)
-    hull = block((-0.5, -draught, -z), (0.5, 0, z), colours.body)
+    hull = slab((-0.5, -draught), (0.5, 0), z, colours.body)
     for side in (-1, 1):
         hull = kept(hull, (0.5, 0, 0), (-z, 0, -side * (0.5 - start)))
     stem = half_space((0.5, 0, 0), (-draught, rake, 0))
     hull = hull.minus(stem)
-    strake = block((-0.51, -0.035, -z - 0.008), (0.5, -0.005, z + 0.008), colours.trim)
+    strake = slab((-0.51, -0.035), (0.5, -0.005), z + 0.008, colours.trim)
     for side in (-1, 1):
         strake = kept(strake, (0.51, 0, 0), (-z, 0, -side * (0.5 - start)))
     return [hull, strake]
@@ -118,21 +118,19 @@ def _rig(p: Parameters, colours: Palette, place: float, masts: str) -> list[Soli
         ((place, tall, boom),) if masts == "one" else ((place, tall, 0.7 * boom), (place - 0.42, 0.65 * tall, 0.16))
     ):
         sail = below(
-            block((x - reach, rise, -0.013), (x, 0.96 * height, 0.013), colours.detail),
+            slab((x - reach, rise), (x, 0.96 * height), 0.013, colours.detail),
             (x - reach, rise),
             (x - 0.02, 0.96 * height),
         )
         parts += [
-            cylinder((x, -0.05, 0), (x, height, 0), 0.014, colours.trim),
-            cylinder((x - reach - 0.01, rise, 0), (x, rise, 0), 0.014, colours.trim),
+            pillar((x, -0.05, 0), height, 0.014, colours.trim),
+            rod((x - reach - 0.01, rise, 0), x, 0.014, colours.trim),
             sail,
         ]
     if foresail == "jib":
         level = p.uniform("jib_height", 0.6, 0.9) * tall
         front = 0.48
-        jib = below(
-            block((place + 0.02, 0.03, -0.013), (front, level, 0.013), colours.detail), (place, level), (front, 0.03)
-        )
+        jib = below(slab((place + 0.02, 0.03), (front, level), 0.013, colours.detail), (place, level), (front, 0.03))
         parts += [jib, cylinder((front - 0.005, -0.01, 0), (place, level + 0.02, 0), 0.013, colours.trim)]
     return parts
 
@@ -165,12 +163,10 @@ def _containers(p: Parameters, colours: Palette, z: float) -> list[Solid]:
     tall, reach = p.uniform("bridge_height", 0.13, 0.22), p.uniform("bridge_length", 0.07, 0.11)
     place = -0.4 if bridge == "stern" else p.uniform("bridge_place", -0.1, 0.05)
     parts = [
-        block((place - reach / 2, -0.01, -0.9 * z), (place + reach / 2, tall, 0.9 * z), colours.trim),
-        block(
-            (place - 0.3 * reach, tall - 0.045, -1.0 * z), (place + 0.6 * reach, tall - 0.015, 1.0 * z), colours.dark
-        ),
-        cylinder((place - 0.75 * reach, 0, 0), (place - 0.75 * reach, tall + 0.04, 0), 0.025, colours.detail),
-        block((-0.48, -0.01, -0.8 * z), (0.22, deck, 0.8 * z), colours.trim),
+        slab((place - reach / 2, -0.01), (place + reach / 2, tall), 0.9 * z, colours.trim),
+        slab((place - 0.3 * reach, tall - 0.045), (place + 0.6 * reach, tall - 0.015), 1.0 * z, colours.dark),
+        pillar((place - 0.75 * reach, 0, 0), tall + 0.04, 0.025, colours.detail),
+        slab((-0.48, -0.01), (0.22, deck), 0.8 * z, colours.trim),
     ]
     size, materials = p.uniform("container", 0.04, 0.06), (colours.body, colours.trim, colours.detail)
     for index, x in enumerate(spaced(-0.47, 0.25, p.count("bays", 5, 8))):
@@ -191,13 +187,9 @@ def _decks(p: Parameters, colours: Palette, z: float) -> list[Solid]:
     parts, y = [], 0.0
     for level in range(p.count("decks", 3, 5)):
         rear, bow, side = start + level * step, front - 1.3 * level * step, z * (0.95 - 0.06 * level)
-        parts.append(block((rear, y - 0.005, -side), (bow, y + storey, side), colours.trim))
+        parts.append(slab((rear, y - 0.005), (bow, y + storey), side, colours.trim))
         parts.append(
-            block(
-                (rear + 0.01, y + 0.3 * storey, -side - 0.004),
-                (bow + 0.004, y + 0.75 * storey, side + 0.004),
-                colours.dark,
-            )
+            slab((rear + 0.01, y + 0.3 * storey), (bow + 0.004, y + 0.75 * storey), side + 0.004, colours.dark)
         )
         y += storey
     rise, size = p.uniform("funnel_height", 0.07, 0.13), p.uniform("funnel_radius", 0.022, 0.04)
@@ -219,24 +211,19 @@ def _tug(p: Parameters, colours: Palette, z: float) -> list[Solid]:
     long, top = p.uniform("house_length", 0.2, 0.32), p.uniform("wheelhouse", 0.1, 0.17)
     rise = p.uniform("mast_height", 0.15, 0.35)
     parts = [
-        block((place - long, -0.01, -0.65 * z), (place + 0.4 * long, 0.55 * tall, 0.65 * z), colours.trim),
-        block(
-            (place - 0.3 * long, 0.5 * tall, -0.5 * z), (place + 0.3 * long, tall + 0.5 * top, 0.5 * z), colours.trim
-        ),
-        block(
-            (place - 0.31 * long, tall - 0.02, -0.52 * z),
-            (place + 0.32 * long, tall + 0.3 * top, 0.52 * z),
-            colours.dark,
-        ),
-        block(
-            (place - 0.36 * long, tall + 0.5 * top - 0.01, -0.58 * z),
-            (place + 0.38 * long, tall + 0.5 * top + 0.025, 0.58 * z),
+        slab((place - long, -0.01), (place + 0.4 * long, 0.55 * tall), 0.65 * z, colours.trim),
+        slab((place - 0.3 * long, 0.5 * tall), (place + 0.3 * long, tall + 0.5 * top), 0.5 * z, colours.trim),
+        slab((place - 0.31 * long, tall - 0.02), (place + 0.32 * long, tall + 0.3 * top), 0.52 * z, colours.dark),
+        slab(
+            (place - 0.36 * long, tall + 0.5 * top - 0.01),
+            (place + 0.38 * long, tall + 0.5 * top + 0.025),
+            0.58 * z,
             colours.body,
         ),
         cylinder((place - 0.7 * long, 0.3 * tall, 0), (place - 0.75 * long, tall + 0.12, 0), 0.05, colours.detail),
-        cylinder((place, tall, 0), (place, tall + top + rise, 0), 0.014, colours.detail),
+        pillar((place, tall, 0), tall + top + rise, 0.014, colours.detail),
         box((place, tall + top + 0.7 * rise, 0), (0.026, 0.026, 0.9 * z), colours.detail),
-        block((-0.42, -0.01, -0.05), (-0.36, 0.09, 0.05), colours.detail),
+        slab((-0.42, -0.01), (-0.36, 0.09), 0.05, colours.detail),
     ]
     tyres = [cylinder((x, -0.05, z - 0.01), (x, -0.05, z + 0.025), 0.045, colours.dark) for x in (-0.35, -0.15, 0.05)]
     return [*parts, *pair(*tyres)]
@@ -257,23 +244,19 @@ def _speedboat(p: Parameters, colours: Palette, z: float) -> list[Solid]:
         ]
         parts += [
             *pair(*seats),
-            block((-0.55, -0.1, -0.045), (-0.46, motor, 0.045), colours.dark),
-            block((-0.56, motor - 0.03, -0.055), (-0.44, motor + 0.04, 0.055), colours.detail),
+            slab((-0.55, -0.1), (-0.46, motor), 0.045, colours.dark),
+            slab((-0.56, motor - 0.03), (-0.44, motor + 0.04), 0.055, colours.detail),
         ]
         return parts
     long = p.uniform("cabin_length", 0.3, 0.45)
     house = below(
-        block((place - long, -0.01, -0.7 * z), (place, tall + 0.02, 0.7 * z), colours.trim),
+        slab((place - long, -0.01), (place, tall + 0.02), 0.7 * z, colours.trim),
         (place - lean, tall + 0.02),
         (place, 0.0),
     )
-    panes = block((place - 0.9 * long, 0.35 * tall, -0.72 * z), (place - lean, 0.85 * tall, 0.72 * z), colours.dark)
-    upper = block(
-        (place - 0.85 * long, tall + 0.01, -0.55 * z), (place - 1.5 * lean, tall + 0.05, 0.55 * z), colours.body
-    )
-    roof = block(
-        (place - 0.8 * long, tall + 0.14, -0.5 * z), (place - 1.5 * lean - 0.02, tall + 0.17, 0.5 * z), colours.trim
-    )
+    panes = slab((place - 0.9 * long, 0.35 * tall), (place - lean, 0.85 * tall), 0.72 * z, colours.dark)
+    upper = slab((place - 0.85 * long, tall + 0.01), (place - 1.5 * lean, tall + 0.05), 0.55 * z, colours.body)
+    roof = slab((place - 0.8 * long, tall + 0.14), (place - 1.5 * lean - 0.02, tall + 0.17), 0.5 * z, colours.trim)
     posts = [
         bar(
             (place - s * long - lean, tall, 0.4 * z),
@@ -313,22 +296,20 @@ def _warship(p: Parameters, colours: Palette, z: float) -> list[Solid]:
             strip,
             *island,
             *planes,
-            cylinder((place, tall, 1.35 * z), (place, tall + mast, 1.35 * z), 0.013, colours.dark),
+            pillar((place, tall, 1.35 * z), tall + mast, 0.013, colours.dark),
         ]
     parts = [
-        block((place - long / 2, -0.01, -0.8 * z), (place + long / 2, 0.4 * tall, 0.8 * z), colours.trim),
-        block((place - 0.1 * long, 0.3 * tall, -0.6 * z), (place + 0.4 * long, tall, 0.6 * z), colours.trim),
-        block(
-            (place + 0.05 * long, 0.75 * tall, -0.65 * z), (place + 0.42 * long, 0.93 * tall, 0.65 * z), colours.dark
-        ),
-        cylinder((place + 0.1 * long, tall - 0.01, 0), (place + 0.1 * long, tall + mast, 0), 0.014, colours.detail),
+        slab((place - long / 2, -0.01), (place + long / 2, 0.4 * tall), 0.8 * z, colours.trim),
+        slab((place - 0.1 * long, 0.3 * tall), (place + 0.4 * long, tall), 0.6 * z, colours.trim),
+        slab((place + 0.05 * long, 0.75 * tall), (place + 0.42 * long, 0.93 * tall), 0.65 * z, colours.dark),
+        pillar((place + 0.1 * long, tall - 0.01, 0), tall + mast, 0.014, colours.detail),
         box((place + 0.1 * long, tall + 0.6 * mast, 0), (0.026, 0.026, 1.1 * z), colours.detail),
         cylinder((place - 0.3 * long, 0.3 * tall, 0), (place - 0.35 * long, 0.9 * tall, 0), 0.03, colours.detail),
     ]
     ahead, behind = place + long / 2, place - long / 2
     for x, y, turn in ((ahead + 0.17, 0.0, 0), (ahead + 0.07, 0.035, 0), (behind - 0.1, 0.0, 180)):
         gun = [
-            cylinder((0, -0.04, 0), (0, 0.035, 0), size, colours.detail),
+            pillar((0, -0.04, 0), 0.035, size, colours.detail),
             *(
                 cylinder((0, 0.02, s * 0.4 * size), (3.2 * size, 0.035, s * 0.4 * size), 0.013, colours.dark)
                 for s in (-1, 1)
@@ -353,10 +334,10 @@ def _submarine(p: Parameters, colours: Palette, beam: float) -> list[Solid]:
     if tail == "x":
         fins = [part.rotated(0, 45) for part in fins]
     tower = [
-        block((place - long / 2, 0, -0.35 * radius), (place + 0.35 * long, radius + tall, 0.35 * radius), colours.trim),
-        cylinder((place + 0.35 * long, 0, 0), (place + 0.35 * long, radius + tall, 0), 0.4 * radius, colours.trim),
-        cylinder((place, radius, 0), (place, radius + tall + 0.1, 0), 0.014, colours.dark),
-        cylinder((place - 0.06, radius, 0), (place - 0.06, radius + tall + 0.06, 0), 0.014, colours.dark),
+        slab((place - long / 2, 0), (place + 0.35 * long, radius + tall), 0.35 * radius, colours.trim),
+        pillar((place + 0.35 * long, 0, 0), radius + tall, 0.4 * radius, colours.trim),
+        pillar((place, radius, 0), radius + tall + 0.1, 0.014, colours.dark),
+        pillar((place - 0.06, radius, 0), radius + tall + 0.06, 0.014, colours.dark),
     ]
     sail_planes = pair(
         wing(
@@ -370,12 +351,12 @@ def _submarine(p: Parameters, colours: Palette, beam: float) -> list[Solid]:
     )
     screw = [box((-0.52, 0, 0), (0.026, 1.5 * radius, 0.035), colours.detail).rotated(0, turn) for turn in (0, 60, 120)]
     return [
-        cylinder((-0.2, 0, 0), (0.5 - nose, 0, 0), radius, colours.body),
+        rod((-0.2, 0, 0), 0.5 - nose, radius, colours.body),
         ellipsoid((0.5 - nose, 0, 0), (nose, radius, radius), colours.body),
         cone((-0.2, 0, 0), (-0.53, 0, 0), radius, 0.2 * radius, colours.body),
         *tower,
         *sail_planes,
         *fins,
         *screw,
-        block((-0.3, 0.5 * radius, -casing), (0.4, 1.04 * radius, casing), colours.detail),
+        slab((-0.3, 0.5 * radius), (0.4, 1.04 * radius), casing, colours.detail),
     ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -83,7 +82,7 @@ def kernel(scene: Scene) -> dict[str, Callable[[], Any]]:
         raise LeftOut("not one call of a kernel")
     reduce, is_sweep = problem.statistic or None, problem.is_sweep
     options = Options.checked("benchmark", "trilinear" if is_sweep else "bilinear", mode_of(scene), reduce=reduce)
-    options = replace(options, stacked=problem.flatten)
+    options = options._replace(stacked=problem.flatten)
     if reason := cpu.why_not("plane_sweep_project" if is_sweep else "unproject", source, options):
         raise LeftOut(reason)
     if is_sweep:

@@ -8,7 +8,6 @@ another size than the camera's image is resized for inside: never rescale K by h
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -374,7 +373,7 @@ def plane_sweep_project(
     kernels.check_backend(who, backend)
     check_flag(who, "flatten", flatten)
     sites = sweep_sites(who, volume, cameras, grid, depths, size, view_mask, options)
-    options = replace(options, stacked=flatten)
+    options = options._replace(stacked=flatten)
     maps, visible = kernels.run("plane_sweep_project", volume, sites, options=options, backend=backend)
     return Projected(maps.flatten(2, 3) if flatten else maps, visible)
 

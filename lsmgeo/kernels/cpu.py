@@ -205,15 +205,10 @@ def _place(call: _Call, sites: Sites, options: Options) -> tuple[Tensor | None, 
     return matrix, direction, x, y, z, mask
 
 
-def _values(call: _Call, values: Tensor, strides: Sequence[int], visible: Tensor) -> None:
-    call.values, call.values_type, call.visible = values.data_ptr(), TYPES[values.dtype], visible.data_ptr()
-    call.values_stride[:] = strides
-
-
-def _gradient(call: _Call, gradient: Tensor, strides: Sequence[int]) -> None:
+def _gradient(call: _Call, gradient: Tensor, options: Options) -> None:
     """Hand over the incoming gradient; split the channels where scenes and views alone would not feed the threads."""
     call.gradient, call.gradient_type = gradient.data_ptr(), TYPES[gradient.dtype]
-    call.gradient_stride[:] = strides
+    call.gradient_stride[:] = _six(gradient, options)
     units = max(1, call.scenes * (1 if call.kind == VOLUMES or call.statistics else call.views))
     chunks = min(call.channels // (2 * LEAST_CHUNK), -(-2 * call.threads // units))
     if chunks * units < call.threads:
@@ -277,8 +272,7 @@ def _lattice_backward(
     into: Tensor | None,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
     call, kept = _lattice(kind, source, sites, options)
-    strides = gradient.stride()
-    _gradient(call, gradient, (strides[0], 0, *strides[1:]) if options.reduce else strides)
+    _gradient(call, gradient, options)
     to_source = _source_gradient(call, source, _channel_axis(kind), into) if needs[0] else None
     parts = _geometry_gradients(call, (needs[1], needs[2] and bool(options.direction), needs[3]))
     _run(call, backward=True)
@@ -288,25 +282,33 @@ def _lattice_backward(
     return to_source, *_together(parts)  # type: ignore[return-value]
 
 
-def images(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """`reference.unproject`; `out` is memory of the answer's shape to write to."""
-    B, V, C = source.shape[:3]
-    call, kept = _lattice(IMAGES, source, sites, options)
-    counts = call.sites[::-1]
-    channels = C + call.depth + 3 * call.direction
-    if options.reduce:
-        values = (
-            fresh((B, channels * len(options.reduce), *counts), source.dtype, (0, 2, 3, 4, 1)) if out is None else out
-        )
-        strides = (values.stride(0), 0, *values.stride()[1:])
-    else:
-        values = fresh((B, V, channels, *counts), source.dtype, (0, 1, 3, 4, 5, 2)) if out is None else out
-        strides = values.stride()
-    visible = torch.empty((B, V, *counts), dtype=torch.bool, device="cpu")
-    _values(call, values, strides, visible)
+def _sample(
+    call: _Call, kept: Sequence[Tensor | None], dtype: torch.dtype, options: Options, out: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Run a call forward; `kept` must live as long as it. `out` is memory of the answer's shape to write to."""
+    counts, reduced = call.sites[::-1], bool(options.reduce)
+    channels = (call.channels + call.depth + 3 * call.direction + call.extra) * max(1, len(options.reduce))
+    views = () if reduced else (call.views,)
+    if out is None:
+        order = (0, 2, 3, 4, 1) if reduced else (0, 1, 4, 5, 2, 3) if options.stacked else (0, 1, 3, 4, 5, 2)
+        out = fresh((call.scenes, *views, channels, *counts), dtype, order)
+    visible = torch.empty((call.scenes, call.views, *counts), dtype=torch.bool, device="cpu")
+    call.values, call.values_type, call.visible = out.data_ptr(), TYPES[out.dtype], visible.data_ptr()
+    call.values_stride[:] = _six(out, options)
     _run(call, backward=False)
     del kept
-    return values, visible
+    return out, visible
+
+
+def _six(values: Tensor, options: Options) -> tuple[int, ...]:
+    """The strides of values (B, V, C', D, H, W), or of (B, C'', D, H, W) where views are reduced, with 0 for those."""
+    strides = values.stride()
+    return (strides[0], 0, *strides[1:]) if options.reduce else strides
+
+
+def images(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """`reference.unproject`; `out` is memory of the answer's shape to write to."""
+    return _sample(*_lattice(IMAGES, source, sites, options), source.dtype, options, out)
 
 
 def images_backward(
@@ -339,20 +341,8 @@ def pixels(
 ) -> tuple[Tensor, Tensor]:
     """Sample images (B, V, C, h, w) at pixels (B, V, N, 2) where `front` (B, V, N), append `extra` (B, V, E, N)."""
     source = _channels_last(source, 2)
-    B, V, C = source.shape[:3]
-    call, kept = _pixel_call(source, pixels, front, extra, options)
-    N, channels = front.shape[-1], C + call.extra
-    if options.reduce:
-        values = fresh((B, channels * len(options.reduce), N), source.dtype, (0, 2, 1))
-        strides: tuple[int, ...] = (values.stride(0), 0, values.stride(1), 0, 0, values.stride(2))
-    else:
-        values = fresh((B, V, channels, N), source.dtype, (0, 1, 3, 2))
-        strides = (*values.stride()[:3], 0, 0, values.stride(3))
-    visible = torch.empty((B, V, N), dtype=torch.bool, device="cpu")
-    _values(call, values, strides, visible)
-    _run(call, backward=False)
-    del kept
-    return values, visible
+    values, visible = _sample(*_pixel_call(source, pixels, front, extra, options), source.dtype, options)
+    return values[..., 0, 0, :], visible[:, :, 0, 0]
 
 
 def _pixel_call(
@@ -379,11 +369,7 @@ def pixels_backward(
     """Vector-Jacobian product of `pixels` to source, pixels and extra, each in its dtype."""
     original, source = source, _channels_last(source, 2)
     call, kept = _pixel_call(source, pixels, front, extra, options)
-    strides = gradient.stride()
-    if options.reduce:
-        _gradient(call, gradient, (strides[0], 0, strides[1], 0, 0, strides[2]))
-    else:
-        _gradient(call, gradient, (*strides[:3], 0, 0, strides[3]))
+    _gradient(call, gradient[..., None, None, :], options)
     to_source = _source_gradient(call, source, 2, None) if needs[0] else None
     to_pixels = torch.zeros((call.chunks, *pixels.shape), dtype=torch.float32, device="cpu") if needs[1] else None
     call.pixels_gradient = None if to_pixels is None else to_pixels.data_ptr()
@@ -402,16 +388,7 @@ def pixels_backward(
 
 def volume(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """`reference.plane_sweep_project`; `out` is memory of the answer's shape, any strides, to write to."""
-    call, kept = _lattice(VOLUMES, source, sites, options)
-    counts = call.sites[::-1]
-    shape = (call.scenes, call.views, source.shape[1] + call.depth + 3 * call.direction, *counts)
-    if out is None:
-        out = fresh(shape, source.dtype, (0, 1, 4, 5, 2, 3) if options.stacked else (0, 1, 3, 4, 5, 2))
-    visible = torch.empty((*shape[:2], *counts), dtype=torch.bool, device="cpu")
-    _values(call, out, out.stride(), visible)
-    _run(call, backward=False)
-    del kept
-    return out, visible
+    return _sample(*_lattice(VOLUMES, source, sites, options), source.dtype, options, out)
 
 
 def volume_backward(

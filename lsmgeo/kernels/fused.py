@@ -11,7 +11,6 @@ takes seconds.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -73,28 +72,8 @@ def _sites(given: dict[str, Any]) -> Sites:
     return Sites(*(given[name] for name in Sites._fields))
 
 
-def _flat(options: Options) -> tuple[Any, ...]:
-    return (
-        options.mode,
-        options.padding_mode,
-        options.depth,
-        options.direction,
-        options.reduce,
-        options.near,
-        options.stacked,
-    )
-
-
 def _options(given: dict[str, Any]) -> Options:
-    return Options(
-        given["mode"],
-        given["padding_mode"],
-        given["depth"],
-        given["direction_frame"],
-        tuple(given["reduce"]),
-        given["near"],
-        given["stacked"],
-    )
+    return Options(*(given[part.split()[-1]] for part in _OPTIONS.split(", ")))
 
 
 def _empty(like: Tensor, shape: Sequence[int], order: Sequence[int], dtype: torch.dtype) -> Tensor:
@@ -302,7 +281,7 @@ def _project_reduce(kernels: Any, given: dict[str, Any], options: Options) -> tu
     width = maps.shape[4]
     kernel, offset = _linear(weight, bias)
     memory = None
-    options = replace(options, stacked=False)
+    options = options._replace(stacked=False)
     with torch.autocast(source.device.type, enabled=False):
         for b, v, rows in _tiles(given, given["kernels"]):
             pixels = (rows.stop - rows.start) * width
@@ -329,7 +308,7 @@ def _project_reduce_backward(
     outputs, channels, planes = weight.shape
     (B, V), width, D = sites.matrix.shape[:2], sites.x.shape[0], sites.z.shape[-1]
     kernel, offset = _linear(weight, given["bias"])
-    options, saturates = replace(options, stacked=False), gradient.dtype != torch.float32
+    options, saturates = options._replace(stacked=False), gradient.dtype != torch.float32
     places, needs_weight, needs_bias = needs[:4], needs[4], needs[5]
     to_source = _channels_last(source, source.shape, 1, torch.float32).zero_() if needs[0] else None
     parts = [sites.matrix.new_zeros(shape) for shape in ((B, V, 3, 4), (B, V, 3, 4), (B, V, D))]
@@ -373,29 +352,29 @@ def _project_reduce_backward(
 
 
 def _unproject(kernels: str, source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
-    return torch.ops.lsmgeo.images(source, *sites, *_flat(options), kernels)
+    return torch.ops.lsmgeo.images(source, *sites, *options, kernels)
 
 
 def _sweep(kernels: str, source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
-    return torch.ops.lsmgeo.volume(source, *sites, *_flat(options), kernels)
+    return torch.ops.lsmgeo.volume(source, *sites, *options, kernels)
 
 
 def _reduced_sweep(
     kernels: str, source: Tensor, sites: Sites, weight: Tensor, bias: Tensor | None, options: Options
 ) -> tuple[Tensor, Tensor]:
-    return torch.ops.lsmgeo.project_reduce(source, *sites, weight, bias, *_flat(options), kernels)
+    return torch.ops.lsmgeo.project_reduce(source, *sites, weight, bias, *options, kernels)
 
 
 def _points(kernels: str, source: Tensor, *arguments: Any) -> tuple[Tensor, Tensor]:
     options = arguments[-1]
     pixels, front, extra = project_points(*arguments)
-    return torch.ops.lsmgeo.pixels(source, pixels, front, extra, *_flat(options), kernels)
+    return torch.ops.lsmgeo.pixels(source, pixels, front, extra, *options, kernels)
 
 
 def _views(kernels: str, source: Tensor, *arguments: Any) -> tuple[Tensor, Tensor]:
     options = arguments[-1]
     pixels, front, extra = pixels_in_front(*arguments)
-    return torch.ops.lsmgeo.pixels(source, pixels, front, extra, *_flat(options), kernels)
+    return torch.ops.lsmgeo.pixels(source, pixels, front, extra, *options, kernels)
 
 
 def operators(kernels: str) -> dict[str, Callable[..., Any]]:

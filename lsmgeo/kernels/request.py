@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from torch import Tensor
@@ -46,8 +45,7 @@ class Sites(NamedTuple):
         return self._replace(z=self.z[..., start:stop])
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(NamedTuple):
     """How to sample, what to append and whether to reduce over views; see `lsmgeo.functional.unproject`."""
 
     mode: str

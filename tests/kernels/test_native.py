@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from lsmgeo import functional, rays
 from lsmgeo._sites import image_sites, sweep_sites
 from lsmgeo.errors import BackendError
-from lsmgeo.kernels import Options, cpu, explain, fused
+from lsmgeo.kernels import Options, cpu, explain
 from tests.kernels import cases
 from tests.kernels.comparison import Call, compare, sweep_call, unproject_call
 from tests.property import support
@@ -215,7 +215,6 @@ def test_opcheck(operator):
     options = Options.checked(
         "test", "trilinear" if operator in ("volume", "project_reduce") else "bilinear", augment="depth"
     )
-    flat = fused._flat(options)
     leaf = (cases.FEATURES if operator in ("images", "pixels") else cases.VOLUME).clone().requires_grad_()
     if operator == "pixels":
         arguments = (leaf, cases.PIXELS.clone().requires_grad_(), cases.VALID, cases.DISTANCE[:, :, None])
@@ -232,7 +231,7 @@ def test_opcheck(operator):
     # A gradient of the weights is a sum over all pixels, which a product of matrices may add up in another order.
     terms = cases.B * cases.V * cases.SIZE[0] * cases.SIZE[1]
     tolerance = {"rtol": terms * UNIT_ROUNDOFF[torch.float32], "atol": 1e-5} if operator == "project_reduce" else {}
-    torch.library.opcheck(getattr(torch.ops.lsmgeo, operator).default, (*arguments, *flat, "cpu"), **tolerance)
+    torch.library.opcheck(getattr(torch.ops.lsmgeo, operator).default, (*arguments, *options, "cpu"), **tolerance)
 
 
 def test_second_derivatives_are_those_of_the_reference():

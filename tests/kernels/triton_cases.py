@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -79,7 +78,7 @@ def images_with_geometric_channels() -> None:
 
 @case
 def images_at_the_sites_of_a_frustum() -> None:
-    options = replace(AUGMENTED, padding_mode="border", direction="camera", near=0.4)
+    options = AUGMENTED._replace(padding_mode="border", direction="camera", near=0.4)
     compare(features(batch=2), image_sites(1, batch=2, projective=True, per="scene"), options)
 
 
@@ -116,7 +115,7 @@ def images_maximum() -> None:
 
 @case
 def images_every_statistic_of_everything() -> None:
-    options = replace(AUGMENTED, padding_mode="border", reduce=EVERY)
+    options = AUGMENTED._replace(padding_mode="border", reduce=EVERY)
     compare(features(batch=2), image_sites(8, batch=2, per="view", mask=True), options)
 
 
@@ -126,7 +125,7 @@ def images_in_many_tiles() -> None:
     with patched(**SMALL_TILES):
         for views, statistics in ((1, ()), (2, ("mean", "variance"))):
             sites = image_sites(9, batch=1, views=views, shape=(2, 3, 7))
-            compare(features(6, batch=1, views=views), sites, replace(AUGMENTED, reduce=statistics))
+            compare(features(6, batch=1, views=views), sites, AUGMENTED._replace(reduce=statistics))
 
 
 @case
@@ -468,7 +467,7 @@ def pixels_far_outside() -> None:
 @case
 def deterministic_sums() -> None:
     sites = image_sites(15)
-    for options in (AUGMENTED, replace(AUGMENTED, padding_mode="border", reduce=("variance", "mean"))):
+    for options in (AUGMENTED, AUGMENTED._replace(padding_mode="border", reduce=("variance", "mean"))):
         count = 14 if options.reduce else 7
         shape = (B, count, *SHAPE) if options.reduce else (B, V, count, *SHAPE)
         cotangent = 1e-9 * torch.randn(shape, generator=generator(2))

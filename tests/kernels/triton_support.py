@@ -6,7 +6,6 @@ Judged by the reference in float64: the kernels may be a few times as far from i
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -216,7 +215,7 @@ def compare(
     operator: Any = reference.plane_sweep_project if volume else reference.unproject
     if not isinstance(place, Sites):
         operator = sample_pixels
-    plain = replace(options, stacked=False)
+    plain = options._replace(stacked=False)
     with torch.no_grad():
         shape = operator(source, place, plain)[0].shape
     if cotangent is None:

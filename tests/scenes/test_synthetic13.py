@@ -385,9 +385,9 @@ def test_extreme_parameters_make_a_shape(category):
 @pytest.mark.parametrize("bad", [-1, 2**32, 1.0, True, "0"])
 def test_seeds_and_indices_are_checked(bad):
     for call in (synthetic13.shape, synthetic13.split):
-        with pytest.raises(OptionError, match="seed must be an integer"):
+        with pytest.raises(OptionError, match="seed must be a whole number from 0 to 4294967295"):
             call(bad, 0)
-        with pytest.raises(OptionError, match="index must be an integer"):
+        with pytest.raises(OptionError, match="index must be a whole number from 0 to 4294967295"):
             call(0, bad)
 
 

@@ -112,7 +112,7 @@ class RunLog:
         self.scalars(step, {"loss/held_back": found.loss, **by_view, **by_category})
         self.say(f"step {step}: {found.title} {found.words}")
         if found.examples and self.is_writer:
-            self.picture(step, "predicted", draw_examples(found.examples))
+            self.picture(step, draw_examples(found.examples))
 
     def plan(self, steps: int) -> None:
         """The number of steps is known."""
@@ -128,17 +128,15 @@ class RunLog:
                 for name, value in values.items():
                     self._board.add_scalar(name, value, step)
 
-    def picture(self, step: int, name: str, picture: npt.NDArray[np.uint8]) -> None:
-        """A picture (h, w, 3): for TensorBoard, and as ``pictures/NAME_STEP.png``."""
-        if not self.is_writer:
-            return
+    def picture(self, step: int, picture: npt.NDArray[np.uint8]) -> None:
+        """What is predicted (h, w, 3): for TensorBoard, and as ``pictures/predicted_STEP.png``."""
         try:
-            write_atomic(self.folder / "pictures" / f"{name}_{step:08d}.png", encode_png(picture))
+            write_atomic(self.folder / "pictures" / f"predicted_{step:08d}.png", encode_png(picture))
         except DataError as error:
             self._warn("pictures", f"{error}; the run goes on")
         if self._board is not None:
             with self._forgiven():
-                self._board.add_image(name, picture, step, dataformats="HWC")
+                self._board.add_image("predicted", picture, step, dataformats="HWC")
 
     def progress(self, step: int, text: str) -> None:
         """Show where the run is: at every call on a terminal, elsewhere a line every half minute."""

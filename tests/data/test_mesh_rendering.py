@@ -9,7 +9,7 @@ import trimesh
 
 from lsmgeo import cameras, scenes
 from lsmgeo.data import Mesh, from_trimesh, load_mesh, normalise, render_mesh
-from lsmgeo.data.ray_casting import EmbreeCaster, NumpyCaster
+from lsmgeo.data.mesh_rendering import EmbreeCaster, NumpyCaster
 from lsmgeo.errors import BackendError, CameraError, DTypeError, OptionError, ShapeError
 from tests.data.real_meshes import folder_of_meshes, needs_meshes
 from tests.tolerances import TERMWISE, length_error

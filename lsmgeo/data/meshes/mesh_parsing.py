@@ -28,6 +28,11 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "M
 DRACO = "KHR_draco_mesh_compression"
 HARMLESS = ("KHR_materials_", "KHR_texture_transform", "KHR_lights_punctual")
 
+HEADER = re.compile(
+    rb"ply\r?\nformat (ascii|binary_little_endian|binary_big_endian) 1\.0\s*\n"
+    rb"((comment|obj_info|element|property)\b[^\n]*\n)*"
+)
+
 Materials = Mapping[str, Sequence[float]]
 
 
@@ -156,9 +161,9 @@ def _ply(content: bytes, max_faces: int, _: Materials) -> Parsed:
     from trimesh.exchange.ply import load_ply
 
     head, _mark, body = content.partition(b"end_header")
-    form = re.match(rb"ply\r?\nformat (ascii|binary_little_endian|binary_big_endian) ", head)
-    if form is None or len(head) > MAX_LINE:
-        raise Unreadable("is not a PLY file (no header from ply and format to end_header)")
+    form = HEADER.fullmatch(head[:MAX_LINE])
+    if form is None:
+        raise Unreadable("is not a PLY file (no header from ply and format to end_header, or an unknown line in it)")
     text = form[1] == b"ascii"
     # Each line of text is held as an array.
     lines = body.count(b"\n") + body.count(b"\r") if text else 0
@@ -178,13 +183,19 @@ def _ply(content: bytes, max_faces: int, _: Materials) -> Parsed:
         if any((column["f0"] != column["f1"].shape[1]).any() for column in lists):
             raise Unreadable(f"has lists of differing length in {name}; in a binary file they are not read")
     vertex, face = (elements[name]["data"] for name in ("vertex", "face"))
-    polygons = next(face[name] for name in ("vertex_indices", "vertex_index") if name in elements["face"]["properties"])
-    polygons = polygons if text else polygons["f1"]
+    properties = list(elements["face"]["properties"])
+    place = next(place for place, name in enumerate(properties) if name in ("vertex_indices", "vertex_index"))
+    polygons = face[properties[place]] if text else face[properties[place]]["f1"]
     points = np.stack([np.ravel(vertex[axis]).astype(np.float64) for axis in "xyz"], 1)
     if len(points) != elements["vertex"]["length"] or len(polygons) != elements["face"]["length"]:
         raise Unreadable(f"ends after {len(points)} vertices and {len(polygons)} faces, before those that it announces")
     sizes = np.full(len(polygons), polygons.shape[-1]) if polygons.ndim == 2 else [len(one) for one in polygons]
     corners = np.ravel(polygons) if polygons.ndim == 2 else np.concatenate(list(polygons))
+    if text:
+        start = 1 + sum(elements[name]["length"] for name in list(elements)[: list(elements).index("face")])
+        announced = [float(row.split()[place]) for row in body.splitlines()[start : start + len(sizes)]]
+        if not np.array_equal(announced, sizes):
+            raise Unreadable("a row of face ends inside its list")
     tints, colours = (
         _fractions(np.stack([np.ravel(rows[name]) for name in ("red", "green", "blue")], 1))
         if {"red", "green", "blue"} <= elements[element]["properties"].keys()

@@ -26,6 +26,7 @@ __all__ = [
     "check_geometry",
     "check_mask",
     "check_number",
+    "check_positive",
     "check_size",
     "check_whole",
     "is_whole",
@@ -138,6 +139,13 @@ def check_number(who: str, name: str, value: Any, expected: str) -> float:
 def is_whole(value: Any) -> TypeGuard[int]:
     """Whether a value is a whole number, Python's or numpy's; True and False are none."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def check_positive(who: str, name: str, value: Any) -> float:
+    """Require a finite number above 0."""
+    if not check_number(who, name, value, "a positive number") > 0:
+        raise OptionError(f"{who}: {name} must be a positive number; got {describe(value)}")
+    return float(value)
 
 
 def check_whole(who: str, name: str, value: Any, least: int, most: int = 2**63 - 1) -> int:

@@ -53,7 +53,6 @@ def info(path: str, out: str = "lsmgeo-info") -> int:
     from lsmgeo import data
     from lsmgeo.data.detect import detect
     from lsmgeo.diagnosis import examine
-    from lsmgeo.diagnosis.examination import with_gap
     from lsmgeo.diagnosis.photographs import examine_photographs
     from lsmgeo.diagnosis.pictures import draw_examination
     from lsmgeo.diagnosis.report import report
@@ -64,7 +63,7 @@ def info(path: str, out: str = "lsmgeo-info") -> int:
     drawn: dict[str, tuple[str, bytes]] = {}
     if isinstance(content, data.PosedImages):
         examination = examine_photographs(content)
-        findings = with_gap(examination.findings, content)
+        findings = examination.findings
         verdict = findings.verdict if findings.cause is None else findings.cause.name
         drawn = draw_examination(content, examination, f"{source.resolve().name}: {verdict}")
     else:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from lsmgeo import PlaneSweepProject, Unproject, VoxelGrid, depth_planes, scenes
-from lsmgeo.cameras import CameraTensors, orbit, rays
+from lsmgeo.cameras import CameraTensors, orbit, rays, stack
 from lsmgeo.functional import unproject_points
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def _picture(
 
     Surfaces outside the box are left out; their depth is 0.
     """
-    batch = CameraTensors(*(torch.as_tensor(value)[None] for value in cameras))
+    batch = stack([cameras])
     dark = scenes.Lights(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(3))
     depth = scenes.render([scene], batch, dark, dtype=torch.float64).depth[0]
     origins, directions = rays(cameras)
@@ -105,7 +105,7 @@ def _seen_by(points: Tensor, cameras: CameraTensors, scene: scenes.Scene) -> Ten
     towards = points.reshape(1, -1, 3) - origins  # (V, H * W, 3)
     first = scenes.trace([scene], origins.expand_as(towards).reshape(1, -1, 3), towards.reshape(1, -1, 3)).distance
     nothing = points.new_zeros(1, len(origins), 0, *points.shape[:2])  # the pictures without a channel
-    batch = CameraTensors(*(torch.as_tensor(value)[None] for value in cameras))
+    batch = stack([cameras])
     inside = unproject_points(nothing, batch, points.reshape(1, -1, 3)).visible[0]
     return (inside & (first.view(inside.shape) > 1 - 1e-3)).sum(0).view(points.shape[:2])
 
@@ -134,7 +134,7 @@ def run_demo(*, size: tuple[int, int] = (120, 160), voxels: int = 72, planes: in
     images = images.float()
 
     start = time.perf_counter()
-    batch = CameraTensors(*(torch.as_tensor(value)[None] for value in cameras))
+    batch = stack([cameras])
     unproject = Unproject(grid, reduce="variance", padding_mode="border")
     variance, visible = unproject(images[None], batch)
     enough = visible.sum(1, keepdim=True) >= 3
@@ -168,15 +168,10 @@ def write_picture(result: DemoResult, path: Path) -> Path:
     Raises:
         DataError: the file cannot be written.
     """
-    import io
-
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     from lsmgeo.data import write_atomic
+    from lsmgeo.drawing import as_png, new_figure
 
-    figure = Figure(figsize=(16, 7.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(16, 7.2)
     rows = figure.subfigures(2, 1, height_ratios=(1, 1.75))
     assert isinstance(rows, np.ndarray)
     top, bottom = rows
@@ -208,9 +203,7 @@ def write_picture(result: DemoResult, path: Path) -> Path:
     for axes in (truth, depth, error):
         axes.set_facecolor("0.85")
         axes.set(xlabel="x [pixel]", ylabel="y [pixel]")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100)
-    return write_atomic(path, buffer.getvalue())
+    return write_atomic(path, as_png(figure))
 
 
 def _draw_slice(axes: Axes, result: DemoResult) -> None:

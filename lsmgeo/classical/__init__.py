@@ -3,7 +3,7 @@
 from lsmgeo.classical.consistency import consistent_views
 from lsmgeo.classical.depth_range import find_depth_range
 from lsmgeo.classical.filtering import guided_filter
-from lsmgeo.classical.matching import MatchingCosts, aggregate_views, matching_costs, matching_costs_slabs
+from lsmgeo.classical.matching import MatchingCosts, aggregate_views, matching_costs
 from lsmgeo.classical.plane_sweep import DepthMap, kept, sweep
 from lsmgeo.classical.planes import sweep_planes
 from lsmgeo.classical.reconstruct import Reconstruction, SceneReconstruction, reconstruct_scene, reconstruct_view
@@ -33,7 +33,6 @@ __all__ = [
     "hull_box",
     "kept",
     "matching_costs",
-    "matching_costs_slabs",
     "reconstruct_scene",
     "reconstruct_view",
     "select_neighbours",

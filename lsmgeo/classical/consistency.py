@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from lsmgeo import functional
-from lsmgeo._checks import check_float, check_number
+from lsmgeo._checks import check_float, check_positive
 from lsmgeo.cameras import CameraTensors, resize
-from lsmgeo.errors import OptionError, ShapeError
+from lsmgeo.errors import ShapeError
 
 __all__ = ["consistent_views"]
 
@@ -73,8 +73,7 @@ def consistent_views(
     for name, value in (("depth", depth), *(("other_depths", other) for other in other_depths)):
         check_float("consistent_views", name, value, "(h, w)", rank=2)
     for name, number in (("pixels", pixels), ("relative", relative)):
-        if not check_number("consistent_views", name, number, "positive") > 0:
-            raise OptionError(f"consistent_views: {name} must be positive; got {number}")
+        check_positive("consistent_views", name, number)
     height, width = depth.shape
     camera = resize(camera, height, width)
     with torch.no_grad():

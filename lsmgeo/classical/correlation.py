@@ -75,11 +75,6 @@ class Correlation:
         for part, factors in columns:
             out[:, part] *= factors
 
-    def compare(self, warped: Floats, out: Floats) -> None:
-        """Write the costs (h, w) of one warped image (h, w)."""
-        self._correlate(warped, out, self._room(3))
-        np.add(out, 1, out=out)
-
     def _correlate(self, warped: Floats, out: Floats, room: Floats) -> None:
         """Write the costs less 1."""
         import cv2

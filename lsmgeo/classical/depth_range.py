@@ -13,8 +13,8 @@ from lsmgeo.data import PosedImages
 
 __all__ = ["find_depth_range"]
 
-# Planes of the coarse sweep, and how much nearer and farther it looks than the cameras tell.
-PLANES = 160
+# Planes of the coarse sweep, views it matches at most, and how much nearer and farther it looks than the cameras tell.
+PLANES, NEIGHBOURS = 160, 4
 NEARER, FARTHER = 0.3, 4.0
 # The best pixels that are believed, how certain they must be, and the least fraction that says anything.
 DENSITY, CONFIDENCE, LEAST = 0.8, 0.3, 0.02
@@ -25,7 +25,6 @@ def find_depth_range(
     scene: PosedImages,
     view: int,
     *,
-    neighbours: int = 4,
     size: int = 160,
     noise: float = 2 / 255,
     memory: int = 1 << 30,
@@ -40,7 +39,6 @@ def find_depth_range(
     Args:
         scene: the posed photographs.
         view: index of the view.
-        neighbours: how many other views to match with, at most.
         size: longer side of the reduced photograph in pixels.
         noise: standard deviation of luminance that counts as no texture.
         memory: bound in bytes on what the sweep adds to the process.
@@ -56,7 +54,7 @@ def find_depth_range(
     if measured is not None:
         return measured
     near, far = default_depth_range(scene, view)
-    chosen = select_neighbours(scene, view, neighbours, near=near, far=far)
+    chosen = select_neighbours(scene, view, NEIGHBOURS, near=near, far=far)
     images, cameras = gather(scene, (view, *chosen), size)
     middle = float(np.sqrt(near * far))
     depths = sweep_planes(cameras, min(near, NEARER * middle), max(far, FARTHER * middle), PLANES)

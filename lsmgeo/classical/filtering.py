@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_float, check_number, check_whole
-from lsmgeo.errors import OptionError, ShapeError
+from lsmgeo._checks import check_float, check_positive, check_whole
+from lsmgeo.errors import ShapeError
 
 __all__ = ["guided_filter"]
 
@@ -49,8 +49,7 @@ def guided_filter(image: Tensor, *, radius: int = 6, eps: float = 1e-4) -> Calla
     if image.ndim != 3 or image.shape[0] not in (1, 3):
         raise ShapeError(f"guided_filter: image must be (1, h, w) or (3, h, w); got {tuple(image.shape)}")
     radius = check_whole("guided_filter", "radius", radius, 1, 2**15)
-    if not check_number("guided_filter", "eps", eps, "positive and finite") > 0:
-        raise OptionError(f"guided_filter: eps must be positive and finite; got {eps}")
+    check_positive("guided_filter", "eps", eps)
     import cv2
 
     guide = np.ascontiguousarray(image.detach().cpu().float().permute(1, 2, 0).numpy())

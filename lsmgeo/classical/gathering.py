@@ -11,7 +11,7 @@ from torch.nn.functional import interpolate
 from lsmgeo.cameras import CameraTensors, resize, stack
 from lsmgeo.data import PosedImages
 
-__all__ = ["gather", "resized", "working_size"]
+__all__ = ["fitted", "gather", "resized"]
 
 
 def gather(scene: PosedImages, views: Sequence[int], size: int) -> tuple[Tensor, CameraTensors]:
@@ -30,16 +30,15 @@ def gather(scene: PosedImages, views: Sequence[int], size: int) -> tuple[Tensor,
     Raises:
         DataError: a photograph cannot be read.
     """
-    shape = working_size(scene, views[0], size)
+    shape = fitted(scene.size(views[0]), size)
     images = torch.stack([resized(scene.load(view), shape) for view in views])
     return images, stack([resize(scene.camera(view), *shape) for view in views])
 
 
-def working_size(scene: PosedImages, view: int, size: int) -> tuple[int, int]:
-    """(h, w) of a photograph whose longer side is brought to so many pixels; it is never enlarged."""
-    height, width = scene.size(view)
-    scale = min(1.0, size / max(height, width))
-    return max(1, round(height * scale)), max(1, round(width * scale))
+def fitted(size: Sequence[int], longest: int) -> tuple[int, int]:
+    """(h, w) whose longer side is brought to so many pixels; it is never enlarged."""
+    scale = min(1.0, longest / max(size))
+    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
 def resized(image: Tensor, shape: tuple[int, int]) -> Tensor:

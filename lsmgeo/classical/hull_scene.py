@@ -13,7 +13,8 @@ from tqdm import tqdm
 from lsmgeo import functional
 from lsmgeo._checks import check_choice, check_whole
 from lsmgeo.cameras import CameraTensors, crop, resize, select, stack
-from lsmgeo.classical.gathering import resized, working_size
+from lsmgeo.classical.gathering import fitted, resized
+from lsmgeo.classical.outputs import Looked
 from lsmgeo.classical.silhouettes import signed_distance, silhouettes
 from lsmgeo.classical.surface import drop_specks, extract_mesh
 from lsmgeo.classical.tsdf import voxel_side
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
     from lsmgeo.grids import VoxelGrid
 
-__all__ = ["HullScene", "HullView", "colour_vertices", "hull_depth", "reconstruct_hull"]
+__all__ = ["HullScene", "colour_vertices", "hull_depth", "outline_iou", "reconstruct_hull"]
 
 # Planes along a ray for every voxel that it crosses, and sites that are looked at in one go.
 PLANES_PER_VOXEL, SITES = 1.0, 1 << 24
@@ -38,31 +39,11 @@ SPECK_FACES = 20
 
 
 @dataclass(frozen=True, eq=False)
-class HullView:
-    """One view of a hull, all maps of one size (h, w).
-
-    Attributes:
-        view: its number.
-        image: (3, h, w) the photograph.
-        camera: its camera at that size.
-        mask: (h, w) bool, the photograph's silhouette.
-        depth: (h, w) camera z where a ray first meets the hull, 0 where it misses.
-        iou: of the silhouette and of the hull's own.
-    """
-
-    view: int
-    image: Tensor
-    camera: CameraTensors
-    mask: Tensor
-    depth: Tensor
-    iou: float
-
-
-@dataclass(frozen=True, eq=False)
 class HullScene:
     """A visual hull and how it looks in every view."""
 
-    views: tuple[HullView, ...]
+    views: tuple[Looked, ...]  # depth where a ray first meets the hull, and the photographs' silhouettes
+    ious: tuple[float, ...]  # of the photographs' silhouettes and of the hull's own
     occupancy: Tensor  # (D, H, W) bool
     grid: VoxelGrid
     mesh: Mesh
@@ -70,7 +51,6 @@ class HullScene:
 
 def reconstruct_hull(
     scene: PosedImages,
-    views: Sequence[int] | None = None,
     *,
     rule: str = "all",
     folder: str | os.PathLike[str] | None = None,
@@ -83,7 +63,6 @@ def reconstruct_hull(
 
     Args:
         scene: posed photographs, see `lsmgeo.data.open`.
-        views: whose silhouettes carve; by default all.
         rule: "all", a solid that lies in every silhouette; or "mean", in three quarters of them, which forgives wrong
             silhouettes; see `lsmgeo.classical.visual_hull`.
         folder: of mask files, see `lsmgeo.classical.silhouettes`.
@@ -103,15 +82,12 @@ def reconstruct_hull(
     check_choice(who, "rule", rule, RULES)
     check_whole(who, "resolution", resolution, 8, 1024)
     check_whole(who, "size", size, 16)
-    chosen = list(range(len(scene)) if views is None else views)
-    if not chosen:
-        raise OptionError(f"{who}: views must name one view at least; got {views}")
-    found = silhouettes(scene, chosen, folder=folder, background=background)
-    for view, mask in zip(chosen, found, strict=True):
+    found = silhouettes(scene, folder=folder, background=background)
+    for view, mask in enumerate(found):
         if not bool(mask.any()):
             raise OptionError(f"{who}: the silhouette of view {view} ({scene.names[view]}) is empty")
-    shape = working_size(scene, chosen[0], size)
-    cameras = stack([resize(scene.camera(view), *shape) for view in chosen])
+    shape = fitted(scene.size(0), size)
+    cameras = stack([resize(scene.camera(view), *shape) for view in range(len(scene))])
     masks = torch.stack([resized(mask[None].float(), shape)[0] > 0.5 for mask in found])
     grid = default_grid(masks, cameras, resolution)
     border = masks.clone()
@@ -123,16 +99,22 @@ def reconstruct_hull(
     hull = visual_hull(soft, cameras, grid, rule=rule, threshold=level, outside=outside)
     if not bool(hull.occupancy.any()):
         raise OptionError(f"{who}: no voxel lies in the silhouettes; rule='mean' forgives wrong ones")
-    looked = []
-    with tqdm(chosen, desc="hull", unit="view", disable=None if progress else True) as bar:
-        for index, view in enumerate(bar):
-            camera = select(cameras, 0, index)
+    looked, ious = [], []
+    with tqdm(masks, desc="hull", unit="view", disable=None if progress else True) as bar:
+        for view, mask in enumerate(bar):
+            camera, image = select(cameras, 0, view), resized(scene.load(view), shape)
             depth = hull_depth(hull.occupancy, grid, camera)
-            both = (depth > 0) & masks[index]
-            iou = float(both.sum()) / max(1, int(((depth > 0) | masks[index]).sum()))
-            looked.append(HullView(view, resized(scene.load(view), shape), camera, masks[index], depth, iou))
+            ious.append(outline_iou(depth, mask))
+            numbers = (("IoU of silhouette and hull", f"{ious[-1]:.3f}"),)
+            looked.append(Looked(view, image, camera, depth, mask.float(), "silhouette", numbers))
     mesh = drop_specks(extract_mesh(hull.support, grid, level=level), SPECK_FACES)
-    return HullScene(tuple(looked), hull.occupancy, grid, colour_vertices(mesh, looked, BEHIND * voxel_side(grid)))
+    mesh = colour_vertices(mesh, looked, BEHIND * voxel_side(grid))
+    return HullScene(tuple(looked), tuple(ious), hull.occupancy, grid, mesh)
+
+
+def outline_iou(depth: Tensor, mask: Tensor) -> float:
+    """Intersection over union of where a solid is seen, by its depth (h, w), and of a silhouette."""
+    return float(((depth > 0) & mask).sum()) / max(1, int(((depth > 0) | mask).sum()))
 
 
 def hull_depth(occupancy: Tensor, grid: VoxelGrid, camera: CameraTensors) -> Tensor:
@@ -182,7 +164,7 @@ def hull_depth(occupancy: Tensor, grid: VoxelGrid, camera: CameraTensors) -> Ten
     return depth
 
 
-def colour_vertices(mesh: Mesh, views: Sequence[HullView], behind: float) -> Mesh:
+def colour_vertices(mesh: Mesh, views: Sequence[Looked], behind: float) -> Mesh:
     """A mesh with the mean of the colours that its vertices have in the photographs that see them.
 
     A view counts by the fourth power of the cosine between its ray and the surface's normal, so that those that look

@@ -11,14 +11,14 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from lsmgeo import functional
-from lsmgeo._checks import check_choice, check_finite, check_float, check_mask, check_number, check_size, check_whole
+from lsmgeo._checks import check_choice, check_finite, check_float, check_mask, check_positive, check_whole
 from lsmgeo.cameras import CameraTensors, select
 from lsmgeo.cameras.tensors import Cameras, as_tensors
 from lsmgeo.classical.correlation import UNRELATED, Correlation, on_threads
 from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.grids import FrustumGrid
 
-__all__ = ["SCORES", "UNRELATED", "MatchingCosts", "aggregate_views", "matching_costs", "matching_costs_slabs"]
+__all__ = ["SCORES", "UNRELATED", "MatchingCosts", "aggregate_views", "matching_costs"]
 
 SCORES = ("zncc", "sad", "census", "cosine")
 LUMINANCE = (0.299, 0.587, 0.114)
@@ -36,7 +36,6 @@ def matching_costs(
     cameras: Cameras,
     depths: Tensor,
     *,
-    size: tuple[int, int] | None = None,
     score: str = "zncc",
     window: int = 5,
     noise: float = 2 / 255,
@@ -62,13 +61,12 @@ def matching_costs(
         images: (V, C, h, w), the reference first: C = 1 grey, C = 3 RGB, any C of features for "cosine" and "sad".
         cameras: leading shape (V,), of the images as they are or of the originals, whatever their sizes.
         depths: (P,) camera z in the reference, world units, positive, ascending.
-        size: (h', w') at which the reference's frustum is sampled; by default that of the images.
         score: "zncc", "sad", "census" or "cosine".
         window: side of the patches in pixels of the reference, odd; 1 is a single pixel.
         noise: standard deviation of the values below which texture counts for little; positive.
 
     Returns:
-        `MatchingCosts`: costs (V-1, P, h', w') of the images' dtype, and visible (V-1, P, h', w'). Differentiable in
+        `MatchingCosts`: costs (V-1, P, h, w) of the images' dtype, and visible (V-1, P, h, w). Differentiable in
         images, cameras and depths ("census" is constant).
 
     Raises:
@@ -88,56 +86,11 @@ def matching_costs(
         True
     """
     check_float("matching_costs", "depths", depths, "(P,)", rank=1)
-    slabs = matching_costs_slabs(
-        images, cameras, depths, depths.shape[0], size=size, score=score, window=window, noise=noise
+    reference, slabs = warp_neighbours(
+        images, cameras, depths, depths.shape[0], score=score, window=window, noise=noise
     )
-    return next(slabs)[1]
-
-
-def matching_costs_slabs(
-    images: Tensor,
-    cameras: Cameras,
-    depths: Tensor,
-    planes_per_slab: int,
-    *,
-    size: tuple[int, int] | None = None,
-    score: str = "zncc",
-    window: int = 5,
-    noise: float = 2 / 255,
-) -> Iterator[tuple[int, MatchingCosts]]:
-    """`matching_costs` for more planes than fit into memory: one slab of planes after another.
-
-    Args:
-        images: (V, C, h, w).
-        cameras: leading shape (V,).
-        depths: (P,), all planes.
-        planes_per_slab: planes of a slab; the last may have fewer.
-        size: see `matching_costs`, like all further options.
-        score: see `matching_costs`.
-        window: see `matching_costs`.
-        noise: see `matching_costs`.
-
-    Yields:
-        ``(start, costs)``: what `matching_costs` gives at planes start to start + planes_per_slab.
-
-    Raises:
-        OptionError, ShapeError, DTypeError, DeviceError, CameraError, GridError: at the call, before the first slab.
-
-    Example:
-        >>> import torch
-        >>> from lsmgeo.cameras import orbit
-        >>> cameras = orbit(torch.tensor([0.0, 10.0]), 0.0, 2.0, focal_length=8.0, height=6, width=8)
-        >>> slabs = matching_costs_slabs(torch.rand(2, 1, 6, 8), cameras, torch.linspace(1.5, 2.5, 5), 2)
-        >>> [(start, tuple(costs.shape)) for start, (costs, visible) in slabs]
-        [(0, (1, 2, 6, 8)), (2, (1, 2, 6, 8)), (4, (1, 1, 6, 8))]
-    """
-    warped = warp_neighbours(
-        images, cameras, depths, planes_per_slab, size=size, score=score, window=window, noise=noise
-    )
-    if warped.correlation is not None:
-        return _fast_costs(warped.slabs, warped.correlation)
-    compare = _comparison(score, warped.reference, window, noise)
-    return ((start, MatchingCosts(compare(volume), visible)) for start, volume, visible in warped.slabs)
+    _, volume, visible = next(slabs)
+    return MatchingCosts(_comparison(score, reference, window, noise)(volume), visible)
 
 
 class Warped(NamedTuple):
@@ -145,7 +98,6 @@ class Warped(NamedTuple):
 
     reference: Tensor  # (C, h, w)
     slabs: Iterator[tuple[int, Tensor, Tensor]]  # first plane, (V-1, C, d, h, w), visible (V-1, d, h, w)
-    correlation: Correlation | None  # where costs can be had without tensor operations
 
 
 def warp_neighbours(
@@ -154,20 +106,17 @@ def warp_neighbours(
     depths: Tensor,
     planes_per_slab: int,
     *,
-    size: tuple[int, int] | None,
     score: str,
     window: int,
     noise: float,
 ) -> Warped:
-    """Check the arguments of `matching_costs_slabs` and begin."""
+    """Check the arguments of `matching_costs`, and warp so many planes at a time."""
     who = "matching_costs"
     check_choice(who, "score", score, SCORES)
     window = check_whole(who, "window", window, 1)
     if window % 2 == 0:
         raise OptionError(f"{who}: window must be odd; got {window}")
-    if not check_number(who, "noise", noise, "a positive number") > 0:
-        raise OptionError(f"{who}: noise must be a positive number; got {noise}")
-    planes_per_slab = check_whole(who, "planes_per_slab", planes_per_slab, 1)
+    check_positive(who, "noise", noise)
     check_float(who, "images", images, "(V, C, h, w)", rank=4)
     if images.shape[0] < 2:
         raise ShapeError(f"{who}: images must be (V, C, h, w) with V at least 2; got {tuple(images.shape)}")
@@ -179,43 +128,15 @@ def warp_neighbours(
             f"{who}: cameras must have the images' leading shape (V,) = ({len(images)},); "
             f"got {tuple(tensors.cam_from_world.shape[:-2])}"
         )
-    height, width = images.shape[2:] if size is None else check_size(who, "size", size, 2, "(h, w)")
     if score in ("zncc", "census"):
         images = luminance(images)
     if score == "zncc":
         # Correlation ignores an offset; without it squares lose less to rounding.
         images = images - images[0].detach().mean()
-    first = select(tensors, 0, 0)
-    alone, others = (
-        CameraTensors(*(torch.as_tensor(field)[part] for field in tensors)) for part in (slice(0, 1), slice(1, None))
-    )
-    reference = images[0]
-    if tuple(reference.shape[1:]) != (height, width):
-        # The reference's own frustum meets its image at the same pixels on every plane.
-        plane = FrustumGrid(first, depths[:1].detach(), (height, width))
-        reference = functional.unproject(images[None, :1], alone, plane, padding_mode="border").volume[0, 0, :, 0]
-    grid = FrustumGrid(first, depths, (height, width))
-    slabs = functional.unproject_slabs(images[None, 1:], others, grid, planes_per_slab, padding_mode="border")
-    correlation = None
-    is_plain = images.device.type == "cpu" and images.dtype == torch.float32 and not torch.is_grad_enabled()
-    if score == "zncc" and is_plain:
-        correlation = Correlation(reference[0], window, noise)
-    return Warped(reference, ((start, volume[0], visible[0]) for start, volume, visible in slabs), correlation)
-
-
-def _fast_costs(
-    slabs: Iterator[tuple[int, Tensor, Tensor]], correlation: Correlation
-) -> Iterator[tuple[int, MatchingCosts]]:
-    for start, volume, visible in slabs:
-        warped = volume[:, 0].flatten(0, 1).contiguous().numpy()
-        costs = torch.empty(visible.shape)
-        out = costs.flatten(0, 1).numpy()
-
-        def compare(number: int, warped: np.ndarray = warped, out: np.ndarray = out) -> None:
-            correlation.compare(warped[number], out[number])
-
-        on_threads(compare, range(len(out)))
-        yield start, MatchingCosts(costs, visible)
+    others = CameraTensors(*(torch.as_tensor(field)[1:] for field in tensors))
+    grid = FrustumGrid(select(tensors, 0, 0), depths, (images.shape[2], images.shape[3]))
+    slabs = functional.unproject_slabs(images[None, 1:], others, grid, max(1, planes_per_slab), padding_mode="border")
+    return Warped(images[0], ((start, volume[0], visible[0]) for start, volume, visible in slabs))
 
 
 def luminance(images: Tensor) -> Tensor:
@@ -344,19 +265,20 @@ def aggregated_costs(
     window: int,
     noise: float,
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """`aggregate_views` of `matching_costs_slabs`: costs (d, h, w) in float32, and whether enough see a site."""
-    warped = warp_neighbours(
-        images, cameras, depths, planes_per_slab, size=None, score=score, window=window, noise=noise
+    """`aggregate_views` of `matching_costs`, slab by slab: costs (d, h, w) float32, and whether enough see a site."""
+    reference, slabs = warp_neighbours(
+        images, cameras, depths, planes_per_slab, score=score, window=window, noise=noise
     )
     best, min_views = _numbers(len(images) - 1, best, min_views)
-    if warped.correlation is None:
-        compare = _comparison(score, warped.reference, window, noise)
-        for _, volume, visible in warped.slabs:
+    is_plain = images.device.type == "cpu" and images.dtype == torch.float32 and not torch.is_grad_enabled()
+    if score != "zncc" or not is_plain:
+        compare = _comparison(score, reference, window, noise)
+        for _, volume, visible in slabs:
             cost, count = aggregate_views(compare(volume), visible, best=best, min_views=min_views)
             yield cost.float(), count >= min_views
         return
-    correlate = warped.correlation.aggregate
-    for _, volume, visible in warped.slabs:
+    correlate = Correlation(reference[0], window, noise).aggregate
+    for _, volume, visible in slabs:
         cost, seen = torch.empty(visible.shape[1:]), torch.empty(visible.shape[1:], dtype=torch.bool)
         arrays = (volume[:, 0].numpy(), visible.numpy(), cost.numpy(), seen.numpy())
 

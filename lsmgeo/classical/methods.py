@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from lsmgeo._checks import check_whole
-from lsmgeo.classical.hull_scene import HullView, reconstruct_hull
+from lsmgeo.classical.hull_scene import reconstruct_hull
 from lsmgeo.classical.outputs import Looked, Results
 from lsmgeo.classical.reconstruct import Reconstruction, reconstruct_scene, reconstruct_view, surface_of
 from lsmgeo.classical.views import default_depth_range, select_neighbours
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
     from lsmgeo.data.meshes import Mesh
 
-__all__ = ["hull_results", "named_colour", "readable", "sweep_results"]
+__all__ = ["hull_results", "mesh_facts", "named_colour", "readable", "sweep_results"]
 
 MOST_NAMED = 5
 # Kept pixels below this fraction are worth a word.
@@ -143,7 +143,7 @@ def sweep_results(
                 f"median {100 * median:.3f} % of the depth at {count} of {observed} sparse points{of_views}",
             )
         )
-    facts += _of_mesh(mesh)
+    facts += mesh_facts(mesh)
     used = tuple({other for one in views for other in one.neighbours})
     return Results(title, tuple(facts), notes, tuple(map(_looked, views)), points, colours, mesh, used)
 
@@ -184,27 +184,26 @@ def hull_results(
         if "no alpha" not in str(error):
             raise
         raise OptionError(f"{error}: --masks FOLDER, or --background white, black or R,G,B") from None
-    ious = [one.iou for one in hull.views]
+    ious = hull.ious
     depth, height, width = hull.occupancy.shape
     volume = 100 * float(hull.occupancy.float().mean())
     facts = [
         ("scene", f"{len(scene)} photographs, {scene.source}"),
         ("hull", f"of {len(ious)} silhouettes, {width} x {height} x {depth} voxels (x, y, z), {volume:.1f} % inside"),
         ("silhouettes", f"IoU with the hull's own {np.mean(ious):.3f} on average, {min(ious):.3f} at least"),
-        *_of_mesh(hull.mesh),
+        *mesh_facts(hull.mesh),
     ]
     notes = []
     worst = int(np.argmin(ious))
     if ious[worst] < 0.8:
-        name = scene.names[hull.views[worst].view]
+        name = scene.names[worst]
         notes.append(
             f"The silhouette of {name} and the hull have an IoU of {ious[worst]:.2f} alone. Where the silhouette holds "
             "more than the object, that is background, and harmless; where the hull lacks a piece of it, another "
             "silhouette or a camera is wrong, which --rule mean forgives."
         )
     ordered = sorted(hull.views, key=lambda one: one.view != view) if view is not None else hull.views
-    nothing = np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8)
-    return Results(title, tuple(facts), tuple(notes), tuple(map(_looked_at_hull, ordered)), *nothing, hull.mesh)
+    return Results(title, tuple(facts), tuple(notes), tuple(ordered), mesh=hull.mesh)
 
 
 def named_colour(background: str | None) -> str | tuple[float, ...] | None:
@@ -269,7 +268,8 @@ def _able(scene: PosedImages, options: dict[str, Any], *, only: int | None = Non
     return able, (f"Not swept: {words}",)
 
 
-def _of_mesh(mesh: Mesh | None) -> list[tuple[str, str]]:
+def mesh_facts(mesh: Mesh | None) -> list[tuple[str, str]]:
+    """How large a mesh is; nothing of one without faces."""
     if mesh is None or not len(mesh.faces):
         return []
     return [("mesh", f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces")]
@@ -289,8 +289,3 @@ def _looked(one: Reconstruction) -> Looked:
         numbers.append(("error at sparse points", f"{100 * one.error.median:.3f} % ({one.error.points} points)"))
     confidence = one.depth_map.confidence
     return Looked(one.view, one.image, one.camera, depth, confidence, "confidence", tuple(numbers))
-
-
-def _looked_at_hull(one: HullView) -> Looked:
-    numbers = (("IoU of silhouette and hull", f"{one.iou:.3f}"),)
-    return Looked(one.view, one.image, one.camera, one.depth, one.mask.float(), "silhouette", numbers)

@@ -8,19 +8,20 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import torch
 
 from lsmgeo.classical import pictures
-from lsmgeo.classical.report_model import Model
-from lsmgeo.classical.report_page import ReportPicture, ReportView, make_page
+from lsmgeo.classical.report_page import make_page
 from lsmgeo.classical.surface import write_mesh
 from lsmgeo.data.cameras_json import FORMAT, NAME, VERSION
 from lsmgeo.data.files import refusing, write_atomic, write_point_cloud
 from lsmgeo.data.images import encode_png
+from lsmgeo.drawing import as_pixels
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from os import PathLike
+
+    import torch
 
     from lsmgeo.cameras import CameraTensors
     from lsmgeo.data import PosedImages
@@ -51,10 +52,10 @@ class Results(NamedTuple):
     title: str
     facts: tuple[tuple[str, str], ...]
     notes: tuple[str, ...]
-    views: tuple[Looked, ...]
-    points: np.ndarray  # (N, 3); none of a hull, whose mesh says all
-    colours: np.ndarray  # (N, 3) uint8
-    mesh: Mesh | None
+    views: tuple[Looked, ...] = ()
+    points: np.ndarray = np.empty((0, 3), np.float32)  # (N, 3); none of a hull, whose mesh says all
+    colours: np.ndarray = np.empty((0, 3), np.uint8)  # (N, 3)
+    mesh: Mesh | None = None
     used: tuple[int, ...] = ()  # photographs that helped, beside those of the views
 
 
@@ -81,10 +82,13 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
     for one, name in zip(results.views, names, strict=True):
         step = max(float(one.depth.max()), 1e-30) / STEPS
         height, width = one.depth.shape
-        shown = (one.image.permute(1, 2, 0) * 255).round().clamp(0, 255).to(torch.uint8).numpy()
-        contents[f"images/{name}.png"] = encode_png(shown)
-        contents[f"depth/{name}.png"] = pictures.depth_as_png16(one.depth, step)
-        contents[f"pictures/{name}.png"] = encode_png(pictures.coloured_depth(one.depth, one.depth > 0))
+        steps = (one.depth.double() / step).round().numpy().astype(np.uint16)
+        for kind, pixels in (
+            ("images", as_pixels(one.image)),
+            ("depth", steps),
+            ("pictures", pictures.coloured_depth(one.depth)),
+        ):
+            contents[f"{kind}/{name}.png"] = encode_png(pixels)
         entries.append(
             {
                 "file": f"images/{name}.png",
@@ -102,13 +106,7 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
     if not len(points) and mesh is not None and mesh.colours is not None:
         points, colours = mesh.vertices, mesh.colours
     summary = pictures.summary(results.views[0], points, colours, results.title)
-    page = make_page(
-        results.title,
-        facts=results.facts,
-        notes=results.notes,
-        views=[_view_of(scene, one) for one in results.views],
-        model=_model_of(scene, results),
-    )
+    page = make_page(results, scene.names, scene.cameras)
     written = {}
     # What an earlier run left, and this one does not write again, is not of these results.
     if mesh is not None and len(mesh.faces):
@@ -161,21 +159,3 @@ def file_names(names: Sequence[str]) -> list[str]:
         taken.add(unique.lower())
         made.append(unique)
     return made
-
-
-def _view_of(scene: PosedImages, one: Looked) -> ReportView:
-    shown = (one.image.permute(1, 2, 0) * 255).round().clamp(0, 255).to(torch.uint8).numpy()
-    limits = pictures.depth_limits(one.depth, one.depth > 0)
-    drawn = [
-        ReportPicture("photograph", shown, "photograph"),
-        ReportPicture("depth [world units]", one.depth.numpy(), "depth", limits),
-        ReportPicture(one.meaning, one.certain.numpy(), "confidence"),
-    ]
-    return ReportView(one.view, scene.names[one.view], drawn, one.numbers)
-
-
-def _model_of(scene: PosedImages, results: Results) -> Model | None:
-    if not len(results.points) and (results.mesh is None or not len(results.mesh.faces)):
-        return None
-    used = (*(one.view for one in results.views), *results.used)
-    return Model(scene.cameras, used, results.mesh, results.points, results.colours)

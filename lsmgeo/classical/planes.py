@@ -17,14 +17,12 @@ __all__ = ["longest_path", "sweep_planes"]
 MOST_PLANES = 1 << 20
 
 
-def sweep_planes(
-    cameras: Cameras, near: float, far: float, num: int = 300, spacing: str = "inverse", *, step: float = 1.0
-) -> Tensor:
+def sweep_planes(cameras: Cameras, near: float, far: float, num: int = 300, spacing: str = "inverse") -> Tensor:
     """Depths of the planes of a sweep from near to far, both included.
 
     "inverse" makes even steps in the neighbours' images where they are beside the reference, "depth" even steps in the
-    world. "disparity" is "inverse" with as many planes as make a step of `step` pixels or less in the neighbour whose
-    sample of the reference's centre moves most.
+    world. "disparity" is "inverse" with as many planes as make a step of a pixel or less in the neighbour whose sample
+    of the reference's centre moves most.
 
     Args:
         cameras: leading shape (V,), the reference first, at the size at which they are matched; only "disparity" looks.
@@ -32,14 +30,12 @@ def sweep_planes(
         far: last depth, larger.
         num: number of planes, at least 3; not used by "disparity".
         spacing: "inverse", "depth" or "disparity".
-        step: pixels, positive; only for "disparity".
 
     Returns:
         (P,) float64, ascending.
 
     Raises:
-        OptionError: an unknown spacing, a range that is no two finite numbers, a step that is not positive or asks for
-            more than 2^20 planes.
+        OptionError: an unknown spacing, a range that is no two finite numbers, more than 2^20 steps of a pixel.
         GridError: near and far not positive and ascending.
 
     Example:
@@ -56,12 +52,10 @@ def sweep_planes(
     ends = (torch.tensor(near, dtype=torch.float64), torch.tensor(far, dtype=torch.float64))
     if spacing != "disparity":
         return depth_planes(*ends, num, spacing=spacing)
-    if not check_number(who, "step", step, "a positive number of pixels") > 0:
-        raise OptionError(f"{who}: step must be a positive number of pixels; got {step}")
     depth_planes(*ends, 2)  # checks them
-    number = math.ceil(longest_path(cameras, near, far) / step) + 1
+    number = math.ceil(longest_path(cameras, near, far)) + 1
     if number > MOST_PLANES:
-        raise OptionError(f"{who}: step must be larger: {step} pixels would take {number} planes")
+        raise OptionError(f"{who}: near must be larger: steps of a pixel would take {number} planes")
     return depth_planes(*ends, max(number, 3), spacing="inverse")
 
 

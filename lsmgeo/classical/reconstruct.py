@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from lsmgeo.classical.planes import MOST_PLANES, sweep_planes
 from lsmgeo.classical.sparse import SparseError, sparse_error
 from lsmgeo.classical.views import camera_centers, default_depth_range, select_neighbours
 from lsmgeo.data import PosedImages
+from lsmgeo.drawing import as_pixels
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid
 
@@ -98,44 +99,14 @@ class SceneReconstruction:
     mesh: Mesh | None
 
 
-def reconstruct_view(
-    scene: PosedImages,
-    view: int,
-    *,
-    neighbours: int = 4,
-    size: int = 640,
-    planes: int = 300,
-    spacing: str = "inverse",
-    near: float | None = None,
-    far: float | None = None,
-    score: str = "zncc",
-    window: int = 5,
-    best: int | None = None,
-    filtered: bool = True,
-    density: float = 0.4,
-    min_views: int = 1,
-    memory: int = 1 << 30,
-    progress: bool = False,
-) -> Reconstruction:
+def reconstruct_view(scene: PosedImages, view: int, *, density: float = 0.4, **options: Any) -> Reconstruction:
     """Reconstruct what one photograph sees, by plane-sweep stereo with its best neighbours.
 
     Args:
         scene: posed photographs, see `lsmgeo.data.open`; two are enough.
         view: index of the reference.
-        neighbours: how many other views to match with, at most.
-        size: longer side of the depth map in pixels; never larger than the photograph.
-        planes: number of depth planes; see `lsmgeo.classical.sweep_planes`.
-        spacing: "inverse", "depth" or "disparity" (then their number follows).
-        near: nearest depth, world units; by default told from the scene, see `lsmgeo.classical.find_depth_range`.
-        far: farthest depth.
-        score: "zncc", "sad" or "census", see `lsmgeo.classical.matching_costs`.
-        window: side of the patches in pixels, odd.
-        best: how many neighbours are averaged at a site, see `lsmgeo.classical.aggregate_views`.
-        filtered: whether costs are averaged along the edges of the photograph, see `lsmgeo.classical.guided_filter`.
         density: largest fraction of the pixels to keep.
-        min_views: least number of neighbours that must see a point; never more than there are.
-        memory: bound in bytes on what the sweep adds to the process.
-        progress: whether to show a progress bar.
+        options: of `reconstruct_scene`, for sweeps.
 
     Returns:
         `Reconstruction`; its mask is empty where nothing can be trusted, as in photographs without texture.
@@ -144,11 +115,7 @@ def reconstruct_view(
         OptionError: an option out of range, or no range or neighbours can be told.
         DataError: a photograph cannot be read.
     """
-    sweeper = _Sweeper(
-        scene, neighbours, size, planes, spacing, near, far, score, window, best, filtered, density, min_views, memory
-    )
-    sweeper.check_view(view)
-    return sweeper.reconstruct(view, progress)
+    return reconstruct_scene(scene, [view], mesh=False, density=density, **options).views[0]
 
 
 def reconstruct_scene(
@@ -163,10 +130,8 @@ def reconstruct_scene(
     far: float | None = None,
     score: str = "zncc",
     window: int = 5,
-    best: int | None = None,
     filtered: bool = True,
     density: float = 0.8,
-    min_views: int = 1,
     min_support: int | None = None,
     mesh: bool = True,
     resolution: int = 192,
@@ -175,29 +140,27 @@ def reconstruct_scene(
 ) -> SceneReconstruction:
     """Reconstruct what several photographs see: depth maps that agree with each other, their points and their surface.
 
-    Every view is swept as `reconstruct_view` does; of its best pixels those are kept with which enough of the other
-    views agree (`lsmgeo.classical.consistent_views`), and the depth maps are fused (`lsmgeo.classical.fuse_depth`).
+    Every view is swept; of its best pixels those are kept with which enough of the other views agree
+    (`lsmgeo.classical.consistent_views`), and the depth maps are fused (`lsmgeo.classical.fuse_depth`).
 
     Args:
         scene: posed photographs, see `lsmgeo.data.open`; two are enough.
         views: the views to sweep; by default all. Each is matched with its best neighbours, swept or not.
-        neighbours: see `reconstruct_view`, like all options that are not described here.
-        size: see `reconstruct_view`.
-        planes: see `reconstruct_view`.
-        spacing: see `reconstruct_view`.
-        near: see `reconstruct_view`; told for every view by default.
-        far: see `reconstruct_view`.
-        score: see `reconstruct_view`.
-        window: see `reconstruct_view`.
-        best: see `reconstruct_view`.
-        filtered: see `reconstruct_view`.
-        density: see `reconstruct_view`; a bound, as pixels must find agreement besides.
-        min_views: see `reconstruct_view`.
+        neighbours: how many other views to match with, at most.
+        size: longer side of the depth maps in pixels; never larger than the photographs.
+        planes: number of depth planes; see `lsmgeo.classical.sweep_planes`.
+        spacing: "inverse", "depth" or "disparity" (then their number follows).
+        near: nearest depth, world units; by default told for every view, see `lsmgeo.classical.find_depth_range`.
+        far: farthest depth.
+        score: "zncc", "sad" or "census", see `lsmgeo.classical.matching_costs`.
+        window: side of the patches in pixels, odd.
+        filtered: whether costs are averaged along the edges of the photograph, see `lsmgeo.classical.guided_filter`.
+        density: largest fraction of the pixels to keep, which must find agreement besides.
         min_support: least number of other swept views that must agree; by default 1, where others are swept.
         mesh: whether to make the surface.
         resolution: voxels along the longest side of the box in which the surface is made.
         memory: bound in bytes on what one sweep adds to the process; depth maps and pictures of all views are kept.
-        progress: whether to show a progress bar, one step a view.
+        progress: whether to show a progress bar, one step a view, or a plane of a single view.
 
     Returns:
         `SceneReconstruction`.
@@ -206,9 +169,7 @@ def reconstruct_scene(
         OptionError: an option out of range, or no range or neighbours can be told.
         DataError: a photograph cannot be read.
     """
-    sweeper = _Sweeper(
-        scene, neighbours, size, planes, spacing, near, far, score, window, best, filtered, density, min_views, memory
-    )
+    sweeper = _Sweeper(scene, neighbours, size, planes, spacing, near, far, score, window, filtered, density, memory)
     chosen = list(range(len(scene))) if views is None else list(views)
     if not chosen or len(set(chosen)) != len(chosen):
         raise OptionError(f"views must name at least one view, none twice; got {views}")
@@ -218,8 +179,9 @@ def reconstruct_scene(
     if min_support is None:
         min_support = min(1, len(chosen) - 1)
     min_support = check_whole("reconstruct_scene", "min_support", min_support, 0, len(chosen) - 1)
-    with tqdm(chosen, desc="sweep", unit="view", disable=None if progress else True) as bar:
-        alone = [sweeper.reconstruct(view) for view in bar]
+    is_one = len(chosen) == 1
+    with tqdm(chosen, desc="sweep", unit="view", disable=None if progress and not is_one else True) as bar:
+        alone = [sweeper.reconstruct(view, progress and is_one) for view in bar]
     swept = tuple(sweeper.supported(one, alone, min_support) for one in alone)
     points = np.concatenate([one.points for one in swept])
     colours = np.concatenate([one.colours for one in swept])
@@ -240,10 +202,8 @@ class _Sweeper:
     far: float | None
     score: str
     window: int
-    best: int | None
     filtered: bool
     density: float
-    min_views: int
     memory: int
 
     def __post_init__(self) -> None:
@@ -276,7 +236,7 @@ class _Sweeper:
             raise OptionError(f"near and far must be positive, finite and ascending; got {near} and {far}")
         return near, far
 
-    def reconstruct(self, view: int, progress: bool = False) -> Reconstruction:
+    def reconstruct(self, view: int, progress: bool) -> Reconstruction:
         scene = self.scene
         near, far = self.depth_range(view)
         chosen = select_neighbours(scene, view, self.neighbours, near=near, far=far)
@@ -288,8 +248,6 @@ class _Sweeper:
             depths,
             score=self.score,
             window=self.window,
-            best=None if self.best is None else min(self.best, len(chosen)),
-            min_views=min(self.min_views, len(chosen)),
             cost_filter=guided_filter(images[0]) if self.filtered else None,
             noise=NOISE,
             memory=self.memory,
@@ -338,7 +296,7 @@ class _Sweeper:
         specks = round(SPECK_FRACTION * depth_map.depth.numel())
         mask = kept(depth_map._replace(depth=torch.where(allowed, depth_map.depth, 0.0)), self.density, specks=specks)
         points = points_of(depth_map.depth, one.camera)[mask].float().numpy()
-        colours = (one.image.permute(1, 2, 0)[mask] * 255).round().to(torch.uint8).numpy()
+        colours = as_pixels(one.image)[mask]
         error = sparse_error(self.scene, one.view, depth_map, kept(depth_map, self.density))
         return replace(one, mask=mask, points=points, colours=colours, error=error)
 

@@ -21,8 +21,8 @@ __all__ = ["mask_folder", "signed_distance", "silhouettes"]
 FOLDERS = ("masks", "mask", "silhouettes", "derived_silhouettes")
 ENDINGS = (".png", ".jpg", ".jpeg")
 COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-# By the background rule, pieces and holes with a smaller fraction of the pixels are taken for noise.
-SPECK_FRACTION = 5e-4
+# By the background rule, channels may differ by so much, and pieces and holes of so few of the pixels are noise.
+TOLERANCE, SPECK_FRACTION = 0.1, 5e-4
 
 
 def silhouettes(
@@ -31,7 +31,6 @@ def silhouettes(
     *,
     folder: str | os.PathLike[str] | None = None,
     background: str | Sequence[float] | None = None,
-    tolerance: float = 0.1,
 ) -> list[Tensor]:
     """Which pixels of posed photographs show the object.
 
@@ -41,7 +40,7 @@ def silhouettes(
 
     A file of a folder has its photograph's name (the ending may differ, and ``name.png.png`` is taken too) and size; a
     pixel belongs to the object where it is brighter than half, and opaque. By the rule, a pixel belongs to the object
-    where a channel differs from the background's colour by more than the tolerance; then pieces and holes smaller than
+    where a channel differs from the background's colour by more than 0.1; then pieces and holes smaller than
     0.05 % of the picture are flipped. What the object shares with the background's colour is lost by it.
 
     Args:
@@ -49,7 +48,6 @@ def silhouettes(
         views: which; all by default.
         folder: of mask files.
         background: "black", "white" or (r, g, b) in [0, 1].
-        tolerance: of the rule, in [0, 1).
 
     Returns:
         (H, W) bool for every view, straightened as the photographs are.
@@ -67,9 +65,7 @@ def silhouettes(
         raise OptionError(f"{who}: give a folder of masks or a background, not both")
     if background is not None:
         colour = _colour(who, background)
-        if not 0 <= check_number(who, "tolerance", tolerance, "a number in [0, 1)") < 1:
-            raise OptionError(f"{who}: tolerance must be a number in [0, 1); got {tolerance!r}")
-        return [_by_background(scene.load(view), colour, tolerance) for view in chosen]
+        return [_by_background(scene.load(view), colour) for view in chosen]
     if folder is None and scene.cut_out:
         masks = [scene.load_mask(view) for view in chosen]
         return [mask for mask in masks if mask is not None]
@@ -139,9 +135,9 @@ def _colour(who: str, background: str | Sequence[float]) -> tuple[float, float, 
     return red, green, blue
 
 
-def _by_background(image: Tensor, colour: tuple[float, float, float], tolerance: float) -> Tensor:
+def _by_background(image: Tensor, colour: tuple[float, float, float]) -> Tensor:
     away = (image - image.new_tensor(colour)[:, None, None]).abs().amax(0)
-    mask = (away > tolerance).numpy()
+    mask = (away > TOLERANCE).numpy()
     least = SPECK_FRACTION * mask.size
     mask = _without_specks(mask, least)
     return torch.from_numpy(~_without_specks(~mask, least))

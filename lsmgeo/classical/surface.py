@@ -28,7 +28,6 @@ def extract_mesh(
     grid: VoxelGrid,
     *,
     level: float | None = None,
-    least_weight: float = 0.0,
     specks: int = 0,
 ) -> Mesh:
     """The surface of a signed distance, of an occupancy or of any field that is larger inside, by marching cubes.
@@ -44,7 +43,6 @@ def extract_mesh(
         field: a `Tsdf`, or (D, H, W): bool, or numbers that are larger inside.
         grid: where it lives.
         level: the value on the surface: by default 0 for a `Tsdf`, 0.5 for others.
-        least_weight: a voxel of a `Tsdf` counts as seen where its weight is more than this.
         specks: pieces with fewer faces than this are dropped.
 
     Returns:
@@ -68,7 +66,6 @@ def extract_mesh(
     T = grid.world_from_lattice.detach().cpu().numpy()
     if T.ndim != 2:
         raise GridError(f"{who}: grid must be of one scene; got {grid}")
-    check_number(who, "least_weight", least_weight, "a number")
     check_whole(who, "specks", specks, 0)
     if level is not None:
         check_number(who, "level", level, "a number")
@@ -83,7 +80,7 @@ def extract_mesh(
         surface = 0.0 if level is None else level
         # Larger inside, like every other field.
         inside = (surface - values).float().numpy()
-        cells = _seen_cells(field.weight.detach().cpu().numpy() > least_weight)
+        cells = _seen_cells(field.weight.detach().cpu().numpy() > 0)
         offset = 0
     else:
         surface = 0.5 if level is None else level

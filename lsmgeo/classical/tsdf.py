@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from lsmgeo import functional
-from lsmgeo._checks import check_finite, check_geometry, check_mask, check_number, check_whole, describe
+from lsmgeo._checks import check_finite, check_geometry, check_mask, check_positive, check_whole, describe
 from lsmgeo._sites import Cameras
 from lsmgeo.cameras import CameraTensors, as_tensors, resize, stack
 from lsmgeo.cameras.tensors import select
@@ -40,7 +40,6 @@ def fuse_depth(
     *,
     truncation: float | None = None,
     colours: Tensor | Iterable[Tensor] | None = None,
-    weights: Tensor | Iterable[Tensor] | None = None,
     background: Tensor | Iterable[Tensor] | None = None,
     memory: int = 1 << 28,
 ) -> Tsdf:
@@ -68,7 +67,6 @@ def fuse_depth(
         truncation: world units; by default 3 times the longest side of a voxel. Noise of depth should stay below it,
             and what is seen only at a grazing angle needs more: behind it, rays cross few voxels before the truncation.
         colours: (V, 3, h, w) RGB in [0, 1], or an iterable of V, of the depth maps' sizes and dtype.
-        weights: (V, h, w) not negative, or an iterable of V: confidence that multiplies the weight of every pixel.
         background: (V, h, w) bool, or an iterable of V: pixels of which it is known that their rays hit nothing. All
             that they cross is outside. Their rim, one pixel wide, is left out.
         memory: bound in bytes on what fusing holds beside the results and one view's maps.
@@ -78,7 +76,7 @@ def fuse_depth(
 
     Raises:
         ShapeError, DTypeError: maps that are none, of other sizes than the depth maps, or not V of them.
-        OptionError: negative or infinite depths or weights, a truncation that is not positive.
+        OptionError: depths that are negative or not finite, colours that are not finite, no positive truncation.
         GridError: a grid with one pose a scene.
 
     Example:
@@ -100,15 +98,13 @@ def fuse_depth(
         )
     views = len(tensors.intrinsics)
     truncation = TRUNCATION * voxel_side(grid) if truncation is None else truncation
-    if not check_number(who, "truncation", truncation, "a positive number") > 0:
-        raise OptionError(f"{who}: truncation must be a positive number; got {truncation!r}")
+    check_positive(who, "truncation", truncation)
     check_whole(who, "memory", memory, 1)
     columns = [
         _each(who, name, value, views)
         for name, value in (
             ("depths", depths),
             ("colours", colours),
-            ("weights", weights),
             ("background", background),
         )
     ]
@@ -135,7 +131,6 @@ class _Maps(NamedTuple):
 
     depth: Tensor
     colours: Tensor | None
-    weights: Tensor | None
     background: Tensor | None
 
 
@@ -224,8 +219,6 @@ def _feature_maps(maps: _Maps, camera: CameraTensors, truncation: float) -> tupl
     rough, weight = _is_rough(inverse, truncation), _cosine(inverse, camera)
     if inner is not None:
         weight = torch.where(inner, 1, weight)
-    if maps.weights is not None:
-        weight = weight * maps.weights
     smooth = torch.stack((inverse, rough.to(depth.dtype)))
     nearest = torch.stack((inverse, weight))
     return smooth[None, None], nearest[None, None]
@@ -314,7 +307,7 @@ def _each(who: str, name: str, value: Tensor | Iterable[Tensor] | None, views: i
         raise ShapeError(f"{who}: {name} must hold one map for each of the {views} cameras; got {count}")
 
 
-def _checked(who: str, view: int, depth: Any, colours: Any, weights: Any, background: Any) -> _Maps:
+def _checked(who: str, view: int, depth: Any, colours: Any, background: Any) -> _Maps:
     check_geometry(who, f"depths[{view}]", depth, "(h, w)", rank=2)
     size = tuple(depth.shape)
     if not bool((depth.isfinite() & (depth >= 0)).all()):
@@ -326,12 +319,6 @@ def _checked(who: str, view: int, depth: Any, colours: Any, weights: Any, backgr
                 f"{who}: colours[{view}] must be {(3, *size)}, of its depth map; got {tuple(colours.shape)}"
             )
         check_finite(who, f"colours[{view}]", colours)
-    if weights is not None:
-        check_geometry(who, f"weights[{view}]", weights, "(h, w)", rank=2, dtypes=(depth.dtype,))
-        if tuple(weights.shape) != size:
-            raise ShapeError(f"{who}: weights[{view}] must be {size}, as its depth map; got {tuple(weights.shape)}")
-        if not bool((weights.isfinite() & (weights >= 0)).all()):
-            raise OptionError(f"{who}: weights[{view}] must be finite and not negative")
     if background is not None:
         check_mask(who, f"background[{view}]", background, size, "(h, w)")
-    return _Maps(depth, colours, weights, background)
+    return _Maps(depth, colours, background)

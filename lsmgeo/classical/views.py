@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
-import torch
 
 from lsmgeo._checks import check_whole
 from lsmgeo.cameras import CameraTensors, resize, stack
@@ -166,7 +163,7 @@ def measured_depth_range(scene: PosedImages, view: int) -> tuple[float, float] |
     return float(max(low - margin, 0.5 * low)), float(high + margin)
 
 
-def default_depth_range(scene: PosedImages, view: int, neighbours: Sequence[int] | None = None) -> tuple[float, float]:
+def default_depth_range(scene: PosedImages, view: int) -> tuple[float, float]:
     """Nearest and farthest depth of what a view shows, as told by what was measured, or by the cameras.
 
     Where there is no `measured_depth_range`, around the point where the optical axes meet: what lies there fills the
@@ -176,7 +173,6 @@ def default_depth_range(scene: PosedImages, view: int, neighbours: Sequence[int]
     Args:
         scene: the posed photographs.
         view: index of the view.
-        neighbours: the views whose cameras count; by default all.
 
     Raises:
         OptionError: the depth cannot be told; ``near`` and ``far`` must be given.
@@ -185,14 +181,13 @@ def default_depth_range(scene: PosedImages, view: int, neighbours: Sequence[int]
     measured = measured_depth_range(scene, view)
     if measured is not None:
         return measured
-    looking = list(range(len(scene))) if neighbours is None else [view, *neighbours]
-    focus = common_point(CameraTensors(*(value[looking] for value in map(torch.as_tensor, scene.cameras))))
+    focus = common_point(scene.cameras)
     E = scene.cameras.cam_from_world[view].double().numpy()
     K = scene.cameras.intrinsics[view].double().numpy()
     height, width = scene.size(view)
     middle = float(E[2, :3] @ focus + E[2, 3])
     centers = camera_centers(scene.cameras)
-    away = np.linalg.norm(centers[looking] - centers[view], axis=1)
+    away = np.linalg.norm(centers - centers[view], axis=1)
     # Parallel axes: rounding alone decides how far before or behind the cameras they meet.
     if middle > 1e-6 * away.max():
         radius = 0.75 * middle * float(min(0.5 * width / K[0, 0], 0.5 * height / K[1, 1]))

@@ -15,6 +15,7 @@ from lsmgeo._checks import check_choice, check_finite, check_geometry, check_num
 from lsmgeo._sites import Cameras
 from lsmgeo.cameras import CameraTensors, as_tensors, crop, rays, resize, stack
 from lsmgeo.cameras.tensors import select
+from lsmgeo.classical.gathering import fitted
 from lsmgeo.classical.silhouettes import signed_distance
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
 from lsmgeo.grids import VoxelGrid
@@ -50,7 +51,6 @@ def visual_hull(
     rule: str = "mean",
     threshold: float | None = None,
     outside: str = "empty",
-    mode: str = "bilinear",
     memory: int = 1 << 28,
 ) -> VisualHull:
     """Carve a grid by silhouettes: what a voxel's centre meets in every view decides whether it stays.
@@ -73,7 +73,6 @@ def visual_hull(
         threshold: a voxel stays whose support is more than this; by default 0.75 for "mean" and 0.5 for "all".
         outside: what a view says of voxels that it does not see: "empty", that they are off the object, which is
             then wholly in every picture; or "unknown", nothing, and voxels that no view sees are empty.
-        mode: "bilinear" or "nearest".
         memory: bound in bytes on what carving holds beside masks and results.
 
     Returns:
@@ -123,7 +122,7 @@ def visual_hull(
             camera = stack([select(tensors, len(leading) - 1, view)], len(leading) - 1)
             features = values[:, None, None]
             for first, volume, visible in functional.unproject_slabs(
-                features, camera, grid, planes, mode=mode, padding_mode="border"
+                features, camera, grid, planes, padding_mode="border"
             ):
                 said, seen = volume[:, 0, 0], visible[:, 0]
                 here = support[:, first : first + planes]
@@ -254,8 +253,7 @@ def _ball(pictures: Sequence[Picture]) -> tuple[np.ndarray, float]:
 
 def _thinned(mask: Tensor, camera: CameraTensors) -> Picture:
     """A silhouette of no more pixels than coarse voxels need; one that the object touches stays on it."""
-    scale = min(1.0, LONGEST_SIDE / max(mask.shape))
-    height, width = (max(1, round(side * scale)) for side in mask.shape)
+    height, width = fitted(mask.shape, LONGEST_SIDE)
     small = adaptive_max_pool2d(mask[None].to(torch.float32), (height, width))[0] > 0
     return small, resize(camera, height, width)
 

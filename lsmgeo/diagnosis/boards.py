@@ -23,7 +23,7 @@ from lsmgeo.diagnosis.findings import Cause, Check, Findings, Gap
 from lsmgeo.diagnosis.report import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from lsmgeo.data.calibration import CalibratedLens, Calibration
@@ -39,6 +39,7 @@ LIMIT = 1.0
 DOUBT, DOUBTS = 0.25, 4.0
 # Resolutions that are made from each other.
 SCALES = tuple(sorted({a / b for a in (1, 2, 3, 4, 8) for b in (1, 2, 3, 4, 8)} - {1.0}))
+SHUFFLED, EXCHANGED = "frames shuffled", "left and right exchanged"
 EXCHANGE = "The first lens is that of the second pictures: exchange lenses or pictures."
 OPENGL, FLIP = np.diag([1.0, -1.0, -1.0]), np.diag([1.0, -1.0, 1.0])
 
@@ -65,6 +66,11 @@ class _Report(NamedTuple):
     checks: list[Check]
     causes: list[Cause]
     remarks: list[str]
+
+    def blame(self, name: str, how: str, before: float, after: float, remedy: str, besides: str = "") -> None:
+        """Add a mistake whose correction brings an error in pixels down."""
+        evidence = f"{how} falls from {before:.3g} px to {after:.3g} px{besides}"
+        self.causes.append(Cause(name, evidence, remedy))
 
 
 def examine_calibration(calibration: Calibration, path: Path) -> Findings:
@@ -209,14 +215,14 @@ def _pair_anew(scene: _Scene, stated: float, report: _Report) -> Pairs:
     found = find_pairs(scene.points, lenses, scene.seen[0].found, scene.seen[1].found)
     pairs = [(scene.seen[0].found[a], scene.seen[1].found[b]) for a, b in found]
     stereo = calibrate_stereo(scene.points, lenses, pairs, scene.seen[0].size)
+    what = "the rms of a stereo calibration"
     # A few pictures always agree on some rig; half of all do not.
     if stereo is None or stereo.rms > LIMIT or 2 * len(pairs) < min(map(len, numbers)):
         return []
     told = [(scene.paths[0][numbers[0][a]].name, scene.paths[1][numbers[1][b]].name) for a, b in found]
     some = ", ".join(f"{first} with {second}" for first, second in told[:4])
-    evidence = f"paired otherwise, the rms of a stereo calibration falls from {stated:.3g} px to {stereo.rms:.3g} px"
     remedy = f"List beside each other the pictures that were taken at once: {some}{', ...' if len(told) > 4 else ''}."
-    report.causes.append(Cause("frames shuffled", evidence, remedy))
+    report.blame(SHUFFLED, f"paired otherwise, {what}", stated, stereo.rms, remedy)
     return pairs
 
 
@@ -254,8 +260,7 @@ def _examine_lenses(calibration: Calibration, scene: _Scene, report: _Report) ->
         swapped = [rms(board_errors(calibration.lenses[name], scene.points, side.found)) for name, side in both]
         if all(_is_right(error, scene, side) for side, error in enumerate(swapped)):
             stated = max(off["first"], off["second"])
-            evidence = f"exchanged, the rms under the lenses falls from {stated:.3g} px to {max(swapped):.3g} px"
-            report.causes.append(Cause("left and right exchanged", evidence, EXCHANGE))
+            report.blame(EXCHANGED, "exchanged, the rms under the lenses", stated, max(swapped), EXCHANGE)
             return good
     for name, stated in off.items():
         _explain_lens(name, calibration.lenses[name], stated, scene, sides[name], report)
@@ -276,28 +281,23 @@ def _explain_lens(name: str, lens: CalibratedLens, stated: float, scene: _Scene,
     resized = [(rms(board_errors(_scaled(lens, scale), scene.points, seen.found)), scale) for scale in scales]
     error, scale = min(resized, key=lambda pair: np.nan_to_num(pair[0], nan=np.inf))
     if _is_right(error, scene, side) and error < 0.5 * stated and not 0.95 < scale < 1.05:
-        evidence = (
-            f"with K times {scale:.4g}, the rms under the lens {name} falls from {stated:.3g} px to {error:.3g} px"
-        )
         remedy = (
             f"The pictures are {scale:.4g} times as large as those that were calibrated: "
             "scale K by that (c becomes (c + 0.5) s - 0.5), or use pictures of the calibrated size."
         )
-        report.causes.append(Cause("K of another resolution", evidence, remedy))
+        how = f"with K times {scale:.4g}, the rms under the lens {name}"
+        report.blame("K of another resolution", how, stated, error, remedy)
     elif stated > LIMIT and scene.errors and scene.errors[side] < min(LIMIT, 0.5 * stated):
         bent, fitted = distortion_at_corners(lens, seen.size), distortion_at_corners(scene.lenses[side], seen.size)
-        evidence = (
-            f"calibrated anew from the pictures, the rms under the lens {name} falls from {stated:.3g} px to "
-            f"{scene.errors[side]:.3g} px; distortion in the corners is stated as {bent:.3g} px and measured as "
-            f"{fitted:.3g} px"
-        )
+        besides = f"; distortion in the corners is stated as {bent:.3g} px and measured as {fitted:.3g} px"
         k1, other = lens.coefficients[0], scene.lenses[side].coefficients[0]
         if lens.kind == scene.lenses[side].kind and k1 * other < 0 and min(abs(k1), abs(other)) > LEAST_BENT:
-            evidence += f"; the lens bends the other way, k1 is stated as {k1:+.3g} and measured as {other:+.3g}"
+            besides += f"; the lens bends the other way, k1 is stated as {k1:+.3g} and measured as {other:+.3g}"
         remedy = (
             f"{lens.file.name} is not the calibration of these pictures: calibrate anew, or look for the right file."
         )
-        report.causes.append(Cause("lens of other pictures", evidence, remedy))
+        how = f"calibrated anew from the pictures, the rms under the lens {name}"
+        report.blame("lens of other pictures", how, stated, scene.errors[side], remedy, besides)
 
 
 def _scaled(lens: CalibratedLens, scale: float) -> CalibratedLens:
@@ -364,20 +364,19 @@ def _examine_rig(
         swapped = calibration.lenses["second"], calibration.lenses["first"]
         exchanged = error_of(stated, swapped, measured_with(swapped))
         if exchanged < min(LIMIT, 0.5 * error):
-            evidence = f"with the lenses exchanged, the rms of {what} falls from {error:.3g} px to {exchanged:.3g} px"
-            report.causes.append(Cause("left and right exchanged", evidence, EXCHANGE))
+            report.blame(EXCHANGED, f"with the lenses exchanged, the rms of {what}", error, exchanged, EXCHANGE)
             return
-    _explain_pose(stated, error, lambda pose: error_of(pose, (first, second), measured), what, report)
+    if error > LIMIT:
+        errors = [error_of(row[3], (first, second), measured) for row in _other_poses(stated)]
+        _explain_pose(errors, error, f"of {what}", report)
 
 
-def _explain_pose(stated: Pose, error: float, error_of: Callable[[Pose], float], what: str, report: _Report) -> None:
-    if error <= LIMIT:
-        return
-    tried = [(error_of(pose), name, how, remedy) for name, how, remedy, pose in _other_poses(stated)]
-    best, name, how, remedy = min(tried, key=lambda row: np.nan_to_num(row[0], nan=np.inf))
-    if best <= LIMIT and best < 0.5 * error:
-        evidence = f"{how}, the rms of {what} falls from {error:.3g} px to {best:.3g} px"
-        report.causes.append(Cause(name, evidence, remedy))
+def _explain_pose(errors: Sequence[float], error: float, what: str, report: _Report) -> None:
+    """Name the mistake with poses that leaves the least of the errors, in the order of `_other_poses`."""
+    best = int(np.nan_to_num(errors, nan=np.inf).argmin())
+    name, how, remedy, _ = _other_poses(Pose(np.eye(3), np.zeros(3)))[best]
+    if errors[best] <= LIMIT and errors[best] < 0.5 * error:
+        report.blame(name, f"{how}, the rms {what}", error, errors[best], remedy)
 
 
 def _examine_views(calibration: Calibration, scene: _Scene, report: _Report) -> None:
@@ -420,13 +419,8 @@ def _compare_views(
         return
     shuffled = rms(as_is.min(1))
     if shuffled <= LIMIT and len(set(as_is.argmin(1))) == len(rows):
-        evidence = f"in another order, the rms under the poses of {name} falls from {error:.3g} px to {shuffled:.3g} px"
         remedy = "Poses and pictures stand in different orders: list the pictures in the order of the calibration."
-        report.causes.append(Cause("frames shuffled", evidence, remedy))
+        report.blame(SHUFFLED, f"in another order, the rms under the poses of {name}", error, shuffled, remedy)
         return
-    for change, (cause, how, remedy, _) in enumerate(_other_poses(poses[0])):
-        corrected = rms(table(change).diagonal())
-        if corrected <= LIMIT and corrected < 0.5 * error:
-            evidence = f"{how}, the rms under the poses of {name} falls from {error:.3g} px to {corrected:.3g} px"
-            report.causes.append(Cause(cause, evidence, remedy))
-            return
+    corrected = [rms(table(change).diagonal()) for change in range(len(_other_poses(poses[0])))]
+    _explain_pose(corrected, error, f"under the poses of {name}", report)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lsmgeo.diagnosis.geometry import Geometry, fundamental, relative
+from lsmgeo.diagnosis.geometry import Geometry, fundamental, homogeneous, relative
 
 if TYPE_CHECKING:
     from lsmgeo.diagnosis.matching import Matches
@@ -24,9 +24,8 @@ def sampson_distances(matches: Matches, geometry: Geometry) -> np.ndarray:
     and Zisserman, "Multiple View Geometry", section 11.4.3). Two cameras in one place have no epipolar lines: there it
     is half the distance between one pixel and the other's image under the homography K2 A K1^-1, never negative.
     """
-    A, b = relative(geometry, matches.first, matches.second)
-    F = fundamental(geometry, matches.first, matches.second)
-    return _distances(matches.pixels, F[matches.pair], _homographies(geometry, matches, A, b)[matches.pair])
+    F, H = _relations(geometry, matches.first, matches.second)
+    return _distances(matches.pixels, F[matches.pair], H[matches.pair])
 
 
 def residuals(matches: Matches, geometry: Geometry) -> np.ndarray:
@@ -34,48 +33,45 @@ def residuals(matches: Matches, geometry: Geometry) -> np.ndarray:
 
     Of cameras in one place, both coordinates of half the way between a pixel and the other's image.
     """
-    A, b = relative(geometry, matches.first, matches.second)
-    H = _homographies(geometry, matches, A, b)[matches.pair]
+    H = _relations(geometry, matches.first, matches.second)[1][matches.pair]
     found = np.stack([sampson_distances(matches, geometry), np.zeros(len(matches.pair))], 1)
     still = np.isfinite(H[:, 0, 0])
-    if still.any():
-        first, second = matches.pixels[still, 0], matches.pixels[still, 1]
-        moved = (H[still] @ np.concatenate([first, np.ones((len(first), 1))], 1)[..., None])[..., 0]
-        found[still] = 0.5 * np.nan_to_num(moved[:, :2] / moved[:, 2:] - second, nan=1e9)
+    moved = _moved(H[still], matches.pixels[still, 0])
+    found[still] = 0.5 * np.nan_to_num(moved - matches.pixels[still, 1], nan=1e9)
     return found
 
 
 def pair_distances(pixels: np.ndarray, geometry: Geometry, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Median distance of one pair's matches (M, 2, 2) under each of Q pairs of cameras, (Q,) px."""
-    F = fundamental(geometry, first, second)
+    F, H = _relations(geometry, first, second)
+    return np.asarray(np.median(np.abs(_distances(pixels[None], F[:, None], H[:, None])), axis=1))
+
+
+def _relations(geometry: Geometry, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fundamental matrices (P, 3, 3), and the homographies of pairs without baseline, NaN for others."""
     A, b = relative(geometry, first, second)
     H = geometry.K[second] @ A @ np.linalg.inv(geometry.K[first])
     H[(b != 0).any(1)] = np.nan
-    distances = _distances(pixels[None], F[:, None], H[:, None])
-    return np.asarray(np.median(np.abs(distances), axis=1))
+    return fundamental(geometry, first, second), H
 
 
-def _homographies(geometry: Geometry, matches: Matches, A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of pairs without baseline; NaN for others."""
-    H = geometry.K[matches.second] @ A @ np.linalg.inv(geometry.K[matches.first])
-    H[(b != 0).any(1)] = np.nan
-    return np.asarray(H)
+def _moved(H: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        moved = (H @ homogeneous(pixels)[..., None])[..., 0]
+        return np.asarray(moved[..., :2] / moved[..., 2:])
 
 
 def _distances(pixels: np.ndarray, F: np.ndarray, H: np.ndarray) -> np.ndarray:
     """For pixels (..., 2, 2), F and H that broadcast against (..., 3, 3)."""
-    ones = np.ones((*pixels.shape[:-2], 1))
-    a, b = (np.concatenate([pixels[..., index, :], ones], -1) for index in (0, 1))
+    a, b = (homogeneous(pixels[..., index, :]) for index in (0, 1))
     line = (F @ a[..., None])[..., 0]
     back = (F.swapaxes(-1, -2) @ b[..., None])[..., 0]
     root = np.sqrt((line[..., :2] ** 2).sum(-1) + (back[..., :2] ** 2).sum(-1))
     with np.errstate(invalid="ignore", divide="ignore"):
         distance = (b * line).sum(-1) / root
-        if np.isfinite(H).any():
-            moved = (H @ a[..., None])[..., 0]
-            moved = moved[..., :2] / moved[..., 2:]
-            apart = 0.5 * np.linalg.norm(moved - pixels[..., 1, :], axis=-1)
-            distance = np.where(np.isfinite(H[..., 0, 0]), apart, distance)
+    if np.isfinite(H).any():
+        apart = 0.5 * np.linalg.norm(_moved(H, pixels[..., 0, :]) - pixels[..., 1, :], axis=-1)
+        distance = np.where(np.isfinite(H[..., 0, 0]), apart, distance)
     # Neither line nor homography says anything of such a match: no camera pair can be worse.
     return np.nan_to_num(distance, nan=1e9, posinf=1e9, neginf=-1e9)
 
@@ -87,12 +83,11 @@ def in_front(matches: Matches, geometry: Geometry) -> np.ndarray:
     """
     A, b = (value[matches.pair] for value in relative(geometry, matches.first, matches.second))
     inverse = np.linalg.inv(geometry.K)
-    ones = np.ones((len(matches.pair), 1))
-    rays = []
-    for index, views in enumerate((matches.first, matches.second)):
-        homogeneous = np.concatenate([matches.pixels[:, index], ones], 1)
-        rays.append(np.einsum("mij,mj->mi", inverse[views[matches.pair]], homogeneous))
-    turned, ray = np.einsum("mij,mj->mi", A, rays[0]), rays[1]
+    start, ray = (
+        np.einsum("mij,mj->mi", inverse[views[matches.pair]], homogeneous(matches.pixels[:, index]))
+        for index, views in enumerate((matches.first, matches.second))
+    )
+    turned = np.einsum("mij,mj->mi", A, start)
     aa, rr, ar = (turned**2).sum(1), (ray**2).sum(1), (turned * ray).sum(1)
     ab, rb = (turned * b).sum(1), (ray * b).sum(1)
     determinant = aa * rr - ar**2

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lsmgeo.diagnosis.epipolar import in_front, sampson_distances
-from lsmgeo.diagnosis.findings import Check
-from lsmgeo.diagnosis.limits import CENTRED, LIMITS, SIDES, pixel_limit
+from lsmgeo.diagnosis.findings import CENTRED, LIMITS, SIDES, Check, pixel_limit
 from lsmgeo.diagnosis.matching import Matches, grey_picture, match_features
 from lsmgeo.diagnosis.outlines import epipolar_tangency, outline
 from lsmgeo.diagnosis.silhouettes import load_silhouettes, near_cells, occupied_centers, overlap, within_a_cell
@@ -51,29 +50,36 @@ OUTLINE_PAIRS, OUTLINE_PAIRS_TRIED = 300, 60
 PIXELS_TRIED, VIEWS_TRIED = 400, 12
 
 
-class Evidence(Protocol):
+class Evidence:
     """Something that can be measured again with other cameras.
 
     Attributes:
         slow: whether a measurement takes long enough to be spared for hypotheses that are otherwise likely.
+        everything: what is measured to be reported; None where that is all alike.
+        tried: as much of it as it takes to compare hypotheses.
     """
 
-    slow: bool
+    slow = False
+    everything: Any = None
+    tried: Any = None
 
     def measure(self, hypothesis: Hypothesis) -> list[Check]:
         """The checks under a hypothesis, always the same ones, on as much as it takes to compare hypotheses."""
+        return self._measured(hypothesis, self.tried)
 
     def measure_all(self, hypothesis: Hypothesis) -> list[Check]:
         """The checks on all that there is, to be reported."""
+        return self._measured(hypothesis, self.everything)
+
+    def _measured(self, hypothesis: Hypothesis, data: Any) -> list[Check]:
+        raise NotImplementedError
 
 
-class Features:
+class Features(Evidence):
     """Matched features: their distance from epipolar lines, and on which side of the cameras they meet."""
 
-    slow = False
-
     def __init__(self, scene: PosedImages, views: np.ndarray, sizes: np.ndarray, cameras: Geometry) -> None:
-        self.matches = match_features(scene, views)
+        self.matches = self.everything = match_features(scene, views)
         self.limit = pixel_limit(sizes)
         self.tried = self.matches.thinned(MATCHES_TRIED)
         # Whether sides are judged is decided once, so that hypotheses are compared on the same checks.
@@ -82,14 +88,6 @@ class Features:
 
     def __bool__(self) -> bool:
         return len(self.matches.pair) > 0
-
-    def measure(self, hypothesis: Hypothesis) -> list[Check]:
-        """Median distance from epipolar lines, and the share in front of both cameras."""
-        return self._measured(hypothesis, self.tried)
-
-    def measure_all(self, hypothesis: Hypothesis) -> list[Check]:
-        """The same on every match."""
-        return self._measured(hypothesis, self.matches)
 
     def _measured(self, hypothesis: Hypothesis, matches: Matches) -> list[Check]:
         distances = np.abs(sampson_distances(matches, hypothesis.photographs))
@@ -118,10 +116,8 @@ def _medians(distances: np.ndarray, matches: Matches) -> np.ndarray:
     return np.array([np.median(distances[a:b]) for a, b in itertools.pairwise(bounds)])
 
 
-class Points:
+class Points(Evidence):
     """Sparse points and their observations."""
-
-    slow = False
 
     def __init__(self, scene: PosedImages, sizes: np.ndarray) -> None:
         assert scene.points is not None
@@ -131,7 +127,7 @@ class Points:
     def __bool__(self) -> bool:
         return sum(len(observed.points) for observed in self.points.observations) >= LEAST_OBSERVATIONS
 
-    def measure(self, hypothesis: Hypothesis) -> list[Check]:
+    def _measured(self, hypothesis: Hypothesis, _: Any) -> list[Check]:
         """Median reprojection error, and the share of observations with their point in front of the camera."""
         errors, depths, _ = reprojection_errors(self.points, hypothesis.beside)
         front = 100 * float(np.mean(depths > 0))
@@ -148,28 +144,18 @@ class Points:
             Check(name, front, "%", LIMITS["in front"], len(errors), "observations", at_least=True),
         ]
 
-    measure_all = measure
 
-
-class DepthMaps:
+class DepthMaps(Evidence):
     """Depth maps of several views."""
 
     slow = True
 
     def __init__(self, scene: PosedImages, views: np.ndarray) -> None:
-        self.surfaces = load_surfaces(scene, views)
+        self.surfaces = self.everything = load_surfaces(scene, views)
         self.tried = thinned(self.surfaces, PIXELS_TRIED, VIEWS_TRIED)
 
     def __bool__(self) -> bool:
         return len(self.surfaces.views) >= 2
-
-    def measure(self, hypothesis: Hypothesis) -> list[Check]:
-        """Median relative difference of depth between views."""
-        return self._measured(hypothesis, self.tried)
-
-    def measure_all(self, hypothesis: Hypothesis) -> list[Check]:
-        """The same on every pixel that was kept."""
-        return self._measured(hypothesis, self.surfaces)
 
     def _measured(self, hypothesis: Hypothesis, surfaces: Surfaces) -> list[Check]:
         errors, _ = relative_errors(surfaces, hypothesis)
@@ -177,10 +163,8 @@ class DepthMaps:
         return [Check("depth of one view in another", value, "%", LIMITS["depth"], len(errors), "pixels")]
 
 
-class StereoPair:
+class StereoPair(Evidence):
     """A rectified pair with depth: one picture fetched by depth is the other one."""
-
-    slow = False
 
     def __init__(self, scene: PosedImages) -> None:
         self.surfaces = load_surfaces(scene, np.arange(2))
@@ -189,7 +173,7 @@ class StereoPair:
     def __bool__(self) -> bool:
         return len(self.surfaces.views) > 0
 
-    def measure(self, hypothesis: Hypothesis) -> list[Check]:
+    def _measured(self, hypothesis: Hypothesis, _: Any) -> list[Check]:
         """Median difference in grey levels, against that without a warp."""
         moved, unmoved = warp_errors(self.surfaces, hypothesis, self.pictures)
         if len(moved) == 0:
@@ -198,13 +182,9 @@ class StereoPair:
         value = float(np.median(moved))
         return [Check("picture warped by depth", value, "grey levels", max(limit, 1.0), len(moved), "pixels")]
 
-    measure_all = measure
 
-
-class Outlines:
+class Outlines(Evidence):
     """Outlines of cut-out photographs: planes through the baseline touch them in both views."""
-
-    slow = False
 
     def __init__(self, scene: PosedImages, views: np.ndarray, sizes: np.ndarray) -> None:
         found = {}
@@ -216,7 +196,7 @@ class Outlines:
         self.outlines = found
         pairs = list(itertools.combinations(sorted(found), 2))
         chosen = np.linspace(0, len(pairs) - 1, min(len(pairs), OUTLINE_PAIRS)).astype(int)
-        self.pairs = [pairs[index] for index in chosen]
+        self.pairs = self.everything = [pairs[index] for index in chosen]
         chosen = np.linspace(0, len(self.pairs) - 1, min(len(pairs), OUTLINE_PAIRS_TRIED)).astype(int)
         self.tried = [self.pairs[index] for index in chosen]
         self.limit = pixel_limit(sizes)
@@ -224,14 +204,6 @@ class Outlines:
     def __bool__(self) -> bool:
         # The two tangents of a single pair agree too often by chance.
         return len(self.pairs) >= LEAST_OUTLINE_PAIRS
-
-    def measure(self, hypothesis: Hypothesis) -> list[Check]:
-        """Median distance between tangents."""
-        return self._measured(hypothesis, self.tried)
-
-    def measure_all(self, hypothesis: Hypothesis) -> list[Check]:
-        """The same on all pairs."""
-        return self._measured(hypothesis, self.pairs)
 
     def _measured(self, hypothesis: Hypothesis, pairs: list[tuple[int, int]]) -> list[Check]:
         distances = self.distances(hypothesis.photographs, pairs)
@@ -245,14 +217,11 @@ class Outlines:
 
     def distance(self, cameras: Geometry, first: int, second: int, camera1: int, camera2: int) -> np.ndarray:
         """(2,) px for two views' outlines seen by two cameras."""
-        E = np.zeros((2, 4, 4))
-        for index, camera in enumerate((camera1, camera2)):
-            E[index, :3, :3], E[index, :3, 3], E[index, 3, 3] = cameras.R[camera], cameras.t[camera], 1.0
-        given = (cameras.K[camera1], E[0], cameras.K[camera2], E[1])
-        return epipolar_tangency(self.outlines[first], self.outlines[second], given)
+        both = cameras.taken(np.array([camera1, camera2]))
+        return epipolar_tangency(self.outlines[first], self.outlines[second], both)
 
 
-class Solids:
+class Solids(Evidence):
     """The solid that photographs show: it projects into the outlines, and depth lies on it."""
 
     slow = True
@@ -268,7 +237,7 @@ class Solids:
         measurable = self.silhouettes is not None or (self.surfaces is not None and bool(self.surfaces.views))
         return len(self.solid.centers) > 0 and measurable
 
-    def measure(self, hypothesis: Hypothesis) -> list[Check]:
+    def _measured(self, hypothesis: Hypothesis, _: Any) -> list[Check]:
         """Cells inside the outlines, overlap with them, and depth points near occupied cells."""
         checks = []
         if self.silhouettes is not None:
@@ -287,13 +256,9 @@ class Solids:
             checks.append(Check(name, value, "%", LIMITS["near a cell"], len(points), "points", at_least=True))
         return checks
 
-    measure_all = measure
 
-
-class Centres:
+class Centres(Evidence):
     """Principal points: near the middle of the picture where nothing else tells whether K belongs to its size."""
-
-    slow = False
 
     def __init__(self, sizes: np.ndarray) -> None:
         self.sizes = sizes
@@ -301,12 +266,10 @@ class Centres:
     def __bool__(self) -> bool:
         return True
 
-    def measure(self, hypothesis: Hypothesis) -> list[Check]:
+    def _measured(self, hypothesis: Hypothesis, _: Any) -> list[Check]:
         """Largest distance of a principal point from the middle."""
         value = 100 * float(principal_offsets(hypothesis.photographs, self.sizes).max())
         return [Check(CENTRED, value, "%", LIMITS["centred"], len(self.sizes), "photographs")]
-
-    measure_all = measure
 
 
 def principal_offsets(cameras: Geometry, sizes: np.ndarray) -> np.ndarray:

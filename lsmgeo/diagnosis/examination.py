@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from lsmgeo.data import PosedImages
 from lsmgeo.data.posed import Voxels
-from lsmgeo.diagnosis.facts import find_gap
 from lsmgeo.diagnosis.photographs import examine_photographs
 
 if TYPE_CHECKING:
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
 
     from lsmgeo.diagnosis.findings import Findings
 
-__all__ = ["examine", "with_gap"]
+__all__ = ["examine"]
 
 
 def examine(content: Any, path: Path) -> Findings:
@@ -32,7 +31,7 @@ def examine(content: Any, path: Path) -> Findings:
         DataError: a file that is needed is missing or damaged.
     """
     if isinstance(content, PosedImages):
-        return with_gap(examine_photographs(content).findings, content)
+        return examine_photographs(content).findings
     if isinstance(content, Voxels):
         from lsmgeo.diagnosis.solids import examine_voxels
 
@@ -40,8 +39,3 @@ def examine(content: Any, path: Path) -> Findings:
     from lsmgeo.diagnosis.boards import examine_calibration
 
     return examine_calibration(content, path)
-
-
-def with_gap(findings: Findings, scene: PosedImages) -> Findings:
-    """The findings about photographs, with the reason where nothing could be measured."""
-    return findings._replace(gap=find_gap(scene)) if findings.verdict == "unknown" else findings

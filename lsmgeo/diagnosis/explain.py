@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.limits import CENTRED, SIDES, badness
+from lsmgeo.diagnosis.findings import CENTRED, SIDES, Check, badness
 from lsmgeo.diagnosis.mistakes import (
     SCALES,
     Candidate,
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from lsmgeo.diagnosis.evidence import Evidence
-    from lsmgeo.diagnosis.findings import Check
     from lsmgeo.diagnosis.geometry import Hypothesis
 
 __all__ = ["Explanation", "explain", "invisible_mistakes", "is_decisive", "is_suspicious", "score"]

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lsmgeo.diagnosis.evidence import DepthMaps, Features, Outlines, StereoPair, principal_offsets
-from lsmgeo.diagnosis.findings import Gap
-from lsmgeo.diagnosis.limits import LIMITS
+from lsmgeo.diagnosis.findings import LIMITS, Gap
 from lsmgeo.diagnosis.matching import LEAST_VERIFIED, MAX_VIEWS, choose_views, count_features
 from lsmgeo.diagnosis.report import counted
 from lsmgeo.diagnosis.surfaces import relative_errors

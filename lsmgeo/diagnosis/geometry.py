@@ -10,7 +10,7 @@ import torch
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
 
-__all__ = ["Geometry", "Hypothesis", "as_they_are", "fundamental", "project", "relative"]
+__all__ = ["Geometry", "Hypothesis", "as_they_are", "fundamental", "homogeneous", "project", "relative"]
 
 # A baseline below this fraction of the cameras' distance from the origin is rounding.
 NO_BASELINE = 1e-9
@@ -61,6 +61,11 @@ def as_they_are(scene: PosedImages) -> Hypothesis:
     return Hypothesis(geometry, geometry)
 
 
+def homogeneous(pixels: np.ndarray) -> np.ndarray:
+    """(..., 2) with a third coordinate 1."""
+    return np.concatenate([pixels, np.ones((*pixels.shape[:-1], 1))], -1)
+
+
 def relative(geometry: Geometry, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A (P, 3, 3) and b (P, 3) with ``X2 = A X1 + b`` from the first cameras' coordinates to the second ones'.
 
@@ -79,12 +84,10 @@ def fundamental(geometry: Geometry, first: np.ndarray, second: np.ndarray) -> np
 
     Equation: F = K2^-T [b]x A K1^-1 (Hartley and Zisserman, "Multiple View Geometry", equation 9.2).
     """
-    A, b = relative(geometry, first, second)
-    cross = np.zeros_like(A)
-    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -b[:, 2], b[:, 1], -b[:, 0]
-    cross -= cross.transpose(0, 2, 1)
-    inverse = np.linalg.inv(geometry.K)
-    return np.asarray(inverse[second].transpose(0, 2, 1) @ cross @ A @ inverse[first])
+    from kornia.geometry.epipolar import cross_product_matrix, fundamental_from_essential
+
+    A, b, K = (torch.from_numpy(value) for value in (*relative(geometry, first, second), geometry.K))
+    return fundamental_from_essential(cross_product_matrix(b) @ A, K[first], K[second]).numpy()
 
 
 def project(geometry: Geometry, view: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -153,14 +153,12 @@ def _mutual(first: torch.Tensor, second: torch.Tensor, ratio: float) -> tuple[np
     """Rows of two sets of words that are each other's nearest, clearly nearer than the next: (M,) and (M,)."""
     if min(len(first), len(second)) < 2:
         return np.zeros(0, int), np.zeros(0, int)
-    near = first @ second.T
-    near = (first * first).sum(1)[:, None] + (second * second).sum(1) - 2 * near
-    back = near.min(0).indices
-    best = near.min(1)
-    rows = torch.arange(len(first))
-    near[rows, best.indices] = float("inf")
-    kept = (back[best.indices] == rows) & (best.values.clamp(min=0) < ratio**2 * near.min(1).values)
-    return rows[kept].numpy(), best.indices[kept].numpy()
+    from kornia.feature import match_snn
+
+    distances = torch.cdist(first, second)
+    rows, columns = match_snn(first, second, ratio, distances)[1].unbind(1)
+    kept = distances.min(0).indices[columns] == rows
+    return rows[kept].numpy(), columns[kept].numpy()
 
 
 def _promising_pairs(found: dict[int, _Features]) -> list[tuple[int, int]]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from lsmgeo.diagnosis.geometry import Geometry, homogeneous
+
 __all__ = ["epipolar_tangency", "outline"]
 
 # An epipole so near to the outline, seen from the outline's middle, makes planes through the baseline that turn a lot
@@ -30,9 +32,7 @@ def outline(mask: np.ndarray) -> np.ndarray | None:
     return cv2.convexHull(np.stack([columns, rows], 1).astype(np.int32))[:, 0].astype(np.float64)
 
 
-def epipolar_tangency(
-    first: np.ndarray, second: np.ndarray, cameras: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-) -> np.ndarray:
+def epipolar_tangency(first: np.ndarray, second: np.ndarray, cameras: Geometry) -> np.ndarray:
     """How far the two planes through the baseline that touch the object in one view are from touching it in the other.
 
     A plane through both camera centres that touches the object does so in both views: its two lines are tangents of the
@@ -42,22 +42,20 @@ def epipolar_tangency(
     Args:
         first: (N, 2) outline in the first view, pixels.
         second: (M, 2) outline in the second.
-        cameras: K and cam_from_world of the first view, then of the second; (3, 3) and (4, 4), any regular matrices.
+        cameras: of the two views.
 
     Returns:
         (2,) distances in pixels, the mean over the two views; NaN where an epipole lies in or near an outline.
     """
     nowhere = np.full(2, np.nan)
-    K, E = cameras[0::2], cameras[1::2]
-    backward = [np.linalg.inv(pose[:3, :3]) for pose in E]
-    centers = [-turn @ pose[:3, 3] for turn, pose in zip(backward, E, strict=True)]
+    K, backward, centers = cameras.K, np.linalg.inv(cameras.R), cameras.centers
     baseline = centers[1] - centers[0]
     length = np.linalg.norm(baseline)
     rays = []
     for points, matrix, turn in zip((first, second), K, backward, strict=True):
-        ray = np.concatenate([points, np.ones((len(points), 1))], 1) @ np.linalg.inv(matrix).T @ turn.T
+        ray = homogeneous(points) @ np.linalg.inv(matrix).T @ turn.T
         rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
-    if not length > 1e-9 * max(1.0, *(float(np.linalg.norm(center)) for center in centers)):
+    if not length > 1e-9 * max(1.0, float(np.linalg.norm(centers, axis=1).max())):
         return nowhere
     axis = baseline / length
     across = [ray - (ray @ axis)[:, None] * axis for ray in rays]  # the part that tells the half-plane

@@ -8,11 +8,10 @@ import numpy as np
 
 from lsmgeo.diagnosis.evidence import Evidence, Features, Points, gather_evidence
 from lsmgeo.diagnosis.explain import explain, invisible_mistakes, is_suspicious
-from lsmgeo.diagnosis.facts import describe_scene, implausibilities
-from lsmgeo.diagnosis.findings import Cause, Check, Findings
+from lsmgeo.diagnosis.facts import describe_scene, find_gap, implausibilities
+from lsmgeo.diagnosis.findings import LIMITS, Cause, Check, Findings, badness
 from lsmgeo.diagnosis.geometry import Hypothesis, as_they_are
 from lsmgeo.diagnosis.half_pixel import Shift, find_shifts, is_certain, is_half_a_pixel, is_large, nearer_half
-from lsmgeo.diagnosis.limits import LIMITS, badness
 from lsmgeo.diagnosis.matching import choose_views
 from lsmgeo.diagnosis.report import tell
 from lsmgeo.diagnosis.sparse import reprojection_errors
@@ -91,7 +90,8 @@ def examine_photographs(scene: PosedImages) -> Examination:
     if cause is None and passed and checks and (hidden := invisible_mistakes(asis, evidence, sizes)):
         remarks.append(f"these mistakes would leave no trace in this data: {', '.join(hidden)}")
     facts = describe_scene(scene, views, evidence, asis, sizes)
-    findings = Findings(tuple(facts), tuple(checks), cause, tuple(remarks))
+    gap = None if checks or cause is not None else find_gap(scene)
+    findings = Findings(tuple(facts), tuple(checks), cause, tuple(remarks), gap=gap)
     return Examination(findings, tuple(evidence), asis, views)
 
 

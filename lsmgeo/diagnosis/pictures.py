@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,13 +9,13 @@ import numpy as np
 from lsmgeo.diagnosis.camera_drawing import Content, draw_cameras, surface_of
 from lsmgeo.diagnosis.epipolar import sampson_distances
 from lsmgeo.diagnosis.evidence import DepthMaps, Features, Solids, StereoPair
-from lsmgeo.diagnosis.geometry import fundamental
+from lsmgeo.diagnosis.geometry import fundamental, homogeneous
 from lsmgeo.diagnosis.silhouettes import draw_solid
 from lsmgeo.diagnosis.surfaces import seen_errors, surface_points, warped
+from lsmgeo.drawing import as_pixels, as_png, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from lsmgeo.data import PosedImages
     from lsmgeo.diagnosis.photographs import Examination
@@ -55,22 +54,6 @@ def draw_examination(scene: PosedImages, examination: Examination, title: str) -
     return pictures
 
 
-def _figure(width: float, height: float, title: str) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title)
-    return figure
-
-
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
-    return buffer.getvalue()
-
-
 def _colours(count: int) -> np.ndarray:
     from matplotlib import colormaps
 
@@ -81,9 +64,9 @@ def _cameras(scene: PosedImages, examination: Examination, title: str) -> bytes:
     """Cameras from above and from the side."""
     cameras = examination.hypothesis.photographs
     sizes = np.array([scene.size(view) for view in range(len(scene))])
-    figure = _figure(14, 7.8, title)
+    figure = new_figure(14, 7.8, title, dpi=DPI)
     draw_cameras(figure, cameras, _content(scene, examination), sizes, _colours(len(scene)))
-    return _png(figure)
+    return as_png(figure)
 
 
 def _content(scene: PosedImages, examination: Examination) -> Content:
@@ -108,7 +91,7 @@ def _shown(scene: PosedImages, view: int) -> tuple[np.ndarray, float]:
     image = scene.load(view)
     height, width = image.shape[1:]
     zoom = max(1.0, max(height, width) / LONGEST_SIDE)
-    picture = (image * 255).round().byte().permute(1, 2, 0).contiguous().numpy()
+    picture = as_pixels(image)
     size = (max(1, round(width / zoom)), max(1, round(height / zoom)))
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA) if zoom > 1 else picture), zoom
 
@@ -136,12 +119,12 @@ def _matches(scene: PosedImages, examination: Examination, features: Features, t
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(MOST_MATCHES, len(chosen))).astype(int)]
     pixels = matches.pixels[chosen]
     F = A[pair]
-    figure = _figure(14, 14 * 0.5 * max(h / w for h, w in map(scene.size, views)) + 1.1, title)
+    figure = new_figure(14, 14 * 0.5 * max(h / w for h, w in map(scene.size, views)) + 1.1, title, dpi=DPI)
     for side, (axes, view) in enumerate(zip(figure.subplots(1, 2), views, strict=True)):
         picture, zoom = _shown(scene, view)
         _show(axes, picture, zoom)
         height, width = scene.size(view)
-        other = np.concatenate([pixels[:, 1 - side], np.ones((len(pixels), 1))], 1)
+        other = homogeneous(pixels[:, 1 - side])
         for (x, y), line, colour in zip(
             pixels[:, side], other @ (F if side == 0 else F.T), _colours(len(pixels)), strict=True
         ):
@@ -156,7 +139,7 @@ def _matches(scene: PosedImages, examination: Examination, features: Features, t
         f"are right; median distance {np.median(distances):.3g} px",
         fontsize=9,
     )
-    return _png(figure)
+    return as_png(figure)
 
 
 def _draw_line(axes: Axes, line: np.ndarray, width: int, height: int, colour: np.ndarray) -> None:
@@ -173,7 +156,7 @@ def _draw_line(axes: Axes, line: np.ndarray, width: int, height: int, colour: np
 def _depth(scene: PosedImages, examination: Examination, item: DepthMaps, title: str) -> bytes:
     """A typical view's depth, and how far the depth of its best neighbour is from it where both are known."""
     found = seen_errors(item.surfaces, examination.hypothesis)
-    figure = _figure(14, 5.2, title)
+    figure = new_figure(14, 5.2, title, dpi=DPI)
     left, right = figure.subplots(1, 2)
     if found:
         medians = {view: float(np.median(np.abs(errors))) for view, (_, _, errors) in found.items()}
@@ -199,13 +182,13 @@ def _depth(scene: PosedImages, examination: Examination, item: DepthMaps, title:
         left.set_title("no view's depth falls into another view")
         for axes in (left, right):
             axes.axis("off")
-    return _png(figure)
+    return as_png(figure)
 
 
 def _warp(examination: Examination, item: StereoPair, title: str) -> bytes:
     """The pair's difference where one picture is fetched by depth, and where it is not."""
     view = item.surfaces.views[0]
-    figure = _figure(14, 5.2, title)
+    figure = new_figure(14, 5.2, title, dpi=DPI)
     left, right = figure.subplots(1, 2)
     height, width = item.pictures[view].shape
     pixels, moved, unmoved = warped(item.surfaces, examination.hypothesis, item.pictures, view)
@@ -217,7 +200,7 @@ def _warp(examination: Examination, item: StereoPair, title: str) -> bytes:
         axes.set_title(f"difference of the two pictures {words}: median {median}", fontsize=10)
         axes.set_xlim(-0.5, width - 0.5)
         axes.set_ylim(height - 0.5, -0.5)
-    return _png(figure)
+    return as_png(figure)
 
 
 def _outlines(scene: PosedImages, examination: Examination, item: Solids, title: str) -> bytes:
@@ -226,7 +209,7 @@ def _outlines(scene: PosedImages, examination: Examination, item: Solids, title:
     rows = np.unique(np.linspace(0, len(item.silhouettes.views) - 1, 8).astype(int)).tolist()
     columns = min(4, len(rows))
     lines = int(np.ceil(len(rows) / columns))
-    figure = _figure(3.4 * columns, 3.6 * lines + 0.8, title)
+    figure = new_figure(3.4 * columns, 3.6 * lines + 0.8, title, dpi=DPI)
     grid = figure.subplots(lines, columns, squeeze=False).ravel()
     for axes in grid:
         axes.axis("off")
@@ -241,4 +224,4 @@ def _outlines(scene: PosedImages, examination: Examination, item: Solids, title:
                 axes.contour(x, y, borders.astype(float), levels=[0.5], colors=[colour], linewidths=1.2)
         axes.set_title(f"{view}: {scene.names[view]}", fontsize=9)
     figure.supxlabel("green: the photograph's outline; red: the voxels, projected", fontsize=9)
-    return _png(figure)
+    return as_png(figure)

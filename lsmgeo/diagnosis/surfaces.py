@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.geometry import Hypothesis, project
+from lsmgeo.diagnosis.geometry import Hypothesis, homogeneous, project
 
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
@@ -97,7 +97,7 @@ def surface_points(surfaces: Surfaces, hypothesis: Hypothesis, view: int) -> np.
     """Where in the world a view's chosen pixels lie, (N, 3)."""
     K, R, t = (value[view] for value in hypothesis.beside)
     pixels = surfaces.pixels[view]
-    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ np.linalg.inv(K).T
+    rays = homogeneous(pixels) @ np.linalg.inv(K).T
     z = surfaces.depths[view] * hypothesis.depth_scale
     if hypothesis.along_ray:
         z = z / np.linalg.norm(rays, axis=1)

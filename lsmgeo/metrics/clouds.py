@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_float, check_number, describe, moved
+from lsmgeo._checks import check_float, check_positive, describe, moved
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
 
 __all__ = ["CloudScores", "point_cloud_scores"]
@@ -61,21 +61,14 @@ def point_cloud_scores(
     from scipy.spatial import cKDTree
 
     who = "point_cloud_scores"
-    limit = _positive(who, "threshold", threshold)
-    side = None if cell is None else _positive(who, "cell", cell)
+    limit = check_positive(who, "threshold", threshold)
+    side = None if cell is None else check_positive(who, "cell", cell)
     clouds = [_as_points(who, name, value) for name, value in (("predicted", predicted), ("true", true))]
     p, t = clouds if side is None else [_averaged(points, side) for points in clouds]
     to_true = cKDTree(t).query(p)[0] if len(t) and len(p) else np.full(len(p), np.inf)
     to_predicted = cKDTree(p).query(t)[0] if len(t) and len(p) else np.full(len(t), np.inf)
     precision, recall = (_mean(distances < limit) for distances in (to_true, to_predicted))
     return CloudScores(_mean(to_true), _mean(to_predicted), precision, recall, _harmonic_mean(precision, recall))
-
-
-def _positive(who: str, name: str, value: float) -> float:
-    number = check_number(who, name, value, "above 0")
-    if not number > 0:
-        raise OptionError(f"{who}: {name} must be above 0; got {value}")
-    return number
 
 
 def _as_points(who: str, name: str, value: Tensor | np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_choice, check_devices, check_float, check_mask, check_number
+from lsmgeo._checks import check_choice, check_devices, check_float, check_mask, check_number, check_positive
 from lsmgeo.errors import OptionError, ShapeError
 
 __all__ = ["BadPixels", "DepthErrors", "MedianDepthError", "bad_pixel_rate", "depth_errors", "median_depth_error"]
@@ -200,9 +200,7 @@ def median_depth_error(
     """
     who = "median_depth_error"
     middle = check_number(who, "center", center, "a number")
-    reach = check_number(who, "radius", radius, "above 0")
-    if not reach > 0:
-        raise OptionError(f"{who}: radius must be above 0; got {radius}")
+    reach = check_positive(who, "radius", radius)
     check_choice(who, "rule", rule, ("paper", "release"))
     p, d, _, counts = _compared(who, "depth", predicted, depth, mask)
     if rule == "paper":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -109,7 +109,30 @@ class Running:
         return {name: _means(collected) for name, collected in self._fields.items()}
 
 
-class VoxelIoU:
+class _OneMeasure:
+    """One number a model, averaged over a set that comes in parts."""
+
+    def __init__(self, **options: Any):
+        self.options = options
+        self._collected: dict[str, list[float]] = {}
+
+    def merge(self, other: Self) -> None:
+        """Take what another one has seen.
+
+        Raises:
+            OptionError: its options differ.
+        """
+        if self.options != other.options:
+            who = type(self).__name__
+            raise OptionError(f"{who}.merge: other must have the options {self.options}; got {other.options}")
+        _extend(self._collected, other._collected)
+
+    def compute(self) -> CategoryMeans:
+        """The means of everything seen so far; NaN where nothing was."""
+        return _means(self._collected)
+
+
+class VoxelIoU(_OneMeasure):
     """Voxel IoU of a set: per category, and the mean of the categories. See `voxel_iou`, `category_means`, `Running`.
 
     Models whose truth has no voxel count nowhere.
@@ -129,8 +152,7 @@ class VoxelIoU:
     """
 
     def __init__(self, *, threshold: float = 0.4):
-        self.threshold = check_number("VoxelIoU", "threshold", threshold, "a number")
-        self._collected: dict[str, list[float]] = {}
+        super().__init__(threshold=check_number("VoxelIoU", "threshold", threshold, "a number"))
 
     def update(self, predicted: Tensor, occupancy: Tensor, categories: Sequence[str] | str = "all") -> None:
         """Measure more models.
@@ -141,25 +163,11 @@ class VoxelIoU:
             categories: B names, or one for all.
         """
         _check_rank("VoxelIoU.update", "predicted", predicted, 4, "(B, D, H, W)")
-        values = voxel_iou(predicted, occupancy, threshold=self.threshold, skip_empty=True)
+        values = voxel_iou(predicted, occupancy, **self.options, skip_empty=True)
         _collect("VoxelIoU.update", self._collected, values, categories)
 
-    def merge(self, other: VoxelIoU) -> None:
-        """Take what another one has seen.
 
-        Raises:
-            OptionError: its threshold differs.
-        """
-        if self.threshold != other.threshold:
-            raise OptionError(f"VoxelIoU.merge: other must have threshold {self.threshold}; got {other.threshold}")
-        _extend(self._collected, other._collected)
-
-    def compute(self) -> CategoryMeans:
-        """The means of everything seen so far, in [0, 1]; NaN where nothing was."""
-        return _means(self._collected)
-
-
-class DepthError:
+class DepthError(_OneMeasure):
     """The paper's depth error of a set: median per map, mean over maps, models and categories.
 
     Views without any pixel that counts are left out of a model's mean, models without any such view out of their
@@ -180,9 +188,8 @@ class DepthError:
     """
 
     def __init__(self, *, center: float = 2.0, radius: float = RADIUS, rule: str = "paper"):
-        self.options: dict[str, Any] = {"center": center, "radius": radius, "rule": rule}
+        super().__init__(center=center, radius=radius, rule=rule)
         median_depth_error(torch.zeros(0, 0), torch.zeros(0, 0), **self.options)  # a wrong option is told here
-        self._collected: dict[str, list[float]] = {}
 
     def update(
         self, predicted: Tensor, depth: Tensor, categories: Sequence[str] | str = "all", mask: Tensor | None = None
@@ -198,20 +205,6 @@ class DepthError:
         _check_rank("DepthError.update", "predicted", predicted, 4, "(B, V, h, w)")
         views = median_depth_error(predicted, depth, mask, **self.options).error
         _collect("DepthError.update", self._collected, views.nanmean(1), categories)
-
-    def merge(self, other: DepthError) -> None:
-        """Take what another one has seen.
-
-        Raises:
-            OptionError: its options differ.
-        """
-        if self.options != other.options:
-            raise OptionError(f"DepthError.merge: other must have {self.options}; got {other.options}")
-        _extend(self._collected, other._collected)
-
-    def compute(self) -> CategoryMeans:
-        """The means of everything seen so far, world units; NaN where nothing was."""
-        return _means(self._collected)
 
 
 def _check_rank(who: str, name: str, value: Any, rank: int, expected: str) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lsmgeo.cameras import CameraTensors, crop, resize, select, stack
-from lsmgeo.classical.gathering import resized
+from lsmgeo.classical.gathering import fitted, resized
 from lsmgeo.classical.silhouettes import signed_distance
 from lsmgeo.classical.views import camera_centers, common_point, project
 from lsmgeo.classical.visual_hull import hull_box, visual_hull
@@ -203,14 +203,12 @@ def _cut(picture: Tensor, window: tuple[int, int, int, int], filling: float) -> 
     """A window (left, right, top, bottom) of (C, H, W), which may reach beyond it."""
     left, right, top, bottom = window
     rows, columns = picture.shape[-2:]
-    within = picture[:, max(0, top) : max(0, min(rows, bottom)), max(0, left) : max(0, min(columns, right))]
-    around = [max(0, -left), max(0, right - columns), max(0, -top), max(0, bottom - rows)]
-    return pad(within, around, value=filling)
+    return pad(picture, (-left, right - columns, -top, bottom - rows), value=filling)  # a negative padding crops
 
 
 def _hull_points(masks: Sequence[Tensor], cameras: CameraTensors) -> np.ndarray:
     """The corners (N, 3) of the voxels of a coarse hull."""
-    sizes = [_reduced(mask) for mask in masks]
+    sizes = [fitted(mask.shape, OUTLINE) for mask in masks]
     small = [resized(mask[None].float(), size)[0] > 0.5 for mask, size in zip(masks, sizes, strict=True)]
     views = stack([resize(select(cameras, 0, view), *size) for view, size in enumerate(sizes)])
     low, high = (np.array(corner) for corner in hull_box(small, views, margin=0.0))
@@ -224,29 +222,20 @@ def _hull_points(masks: Sequence[Tensor], cameras: CameraTensors) -> np.ndarray:
     return np.concatenate([centers - half, centers + half])
 
 
-def _reduced(mask: Tensor) -> tuple[int, int]:
-    """A size whose longer side is as long as a coarse hull needs."""
-    scale = min(1.0, OUTLINE / max(mask.shape))
-    return max(1, round(mask.shape[0] * scale)), max(1, round(mask.shape[1] * scale))
-
-
 def _around(points: np.ndarray, trimmed: tuple[int, int], turn: np.ndarray, told_by: str) -> Placement:
     """The box of points (N, 3) of the turned scene, turned on about the vertical where that makes it smaller."""
+    from scipy.spatial.transform import Rotation
+
     boxes = {}
     for angle in range(-45, 45):
-        low, high = np.percentile(points @ _about_vertical(angle).T, trimmed, axis=0)
+        low, high = np.percentile(Rotation.from_euler("y", angle, degrees=True).apply(points), trimmed, axis=0)
         boxes[angle] = float((high - low)[[0, 2]].prod()), low, high
     best = min(boxes, key=lambda angle: boxes[angle][0])
     if boxes[best][0] > LEAST_GAIN * boxes[0][0]:
         best = 0
-    turn = _about_vertical(best) @ turn
+    turn = Rotation.from_euler("y", best, degrees=True).as_matrix() @ turn
     _, low, high = boxes[best]
     return Placement(turn.T @ ((low + high) / 2), max(float(np.linalg.norm(high - low)), 1e-12), turn, told_by)
-
-
-def _about_vertical(degrees: float) -> np.ndarray:
-    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
 
 
 def _as_trained(scene: PosedImages, placement: Placement) -> Placement | None:
@@ -281,14 +270,13 @@ def _upright(cameras: CameraTensors) -> np.ndarray:
 
     Up is what all cameras' horizontal axes are square to, where they differ enough to tell; else the photographs' up.
     """
+    from scipy.spatial.transform import Rotation
+
     R = cameras.cam_from_world[:, :3, :3].double().numpy()
     across, mean = R[:, 0], -R[:, 1].mean(0)
     spreads, axes = np.linalg.eigh(across.T @ across / len(across))
     up = axes[:, 0] if spreads[1] > LEAST_SPREAD else mean
     up = up / np.linalg.norm(up) * (-1 if up @ mean < 0 else 1)
-    target = np.array([0.0, 1.0, 0.0])
-    cosine, axis = float(up @ target), np.cross(up, target)
-    if cosine < -1 + 1e-9:
+    if up[1] < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.asarray(np.eye(3) + cross + cross @ cross / (1 + cosine))
+    return np.asarray(Rotation.align_vectors([[0.0, 1.0, 0.0]], [up])[0].as_matrix())

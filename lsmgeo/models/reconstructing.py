@@ -15,14 +15,15 @@ from lsmgeo import rays
 from lsmgeo._checks import check_choice, check_number, check_whole
 from lsmgeo.cameras import CameraTensors, resize, stack
 from lsmgeo.classical.consistency import consistent_views
-from lsmgeo.classical.gathering import resized, working_size
-from lsmgeo.classical.hull_scene import HullView, colour_vertices, hull_depth
-from lsmgeo.classical.methods import named_colour
+from lsmgeo.classical.gathering import fitted, resized
+from lsmgeo.classical.hull_scene import colour_vertices, hull_depth, outline_iou
+from lsmgeo.classical.methods import mesh_facts, named_colour
 from lsmgeo.classical.outputs import Looked, Results
 from lsmgeo.classical.reconstruct import points_of
 from lsmgeo.classical.silhouettes import mask_folder, silhouettes
 from lsmgeo.classical.surface import drop_specks, extract_mesh
 from lsmgeo.classical.tsdf import fuse_depth, voxel_side
+from lsmgeo.drawing import as_pixels
 from lsmgeo.errors import OptionError
 from lsmgeo.functional import plane_sweep_project
 from lsmgeo.grids import VoxelGrid
@@ -188,7 +189,7 @@ def learnt_results(
         ),
     )
     notes = (*_barely_trained(model.about), *found.notes)
-    results = Results(title, facts, notes, (), np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8), None)
+    results = Results(title, facts, notes)
     if method == "v-lsm":
         return _with_voxels(scene, results, found, model.grid, threshold, resolution, size)
     return _with_depth(results, found, model.grid, resolution)
@@ -211,33 +212,31 @@ def _with_voxels(
     coarse_grid, fine_grid = (VoxelGrid(n, grid.lower, grid.upper, place) for n in (probability.shape[0], side))
     seen, looked = [], []
     for view, outline in zip(found.views, found.silhouettes, strict=True):
-        shape = working_size(scene, view, size)
+        shape = fitted(scene.size(view), size)
         camera, image = resize(scene.camera(view), *shape), resized(scene.load(view), shape)
         depth = hull_depth(fine > threshold, fine_grid, camera)
         numbers = [("model", f"{100 * float((depth > 0).float().mean()):.1f} % of the picture")]
         coloured = depth
         if outline is not None:
             mask = resized(outline[None].float(), shape)[0] > 0.5
-            iou = float((mask & (depth > 0)).sum()) / max(1, int((mask | (depth > 0)).sum()))
-            numbers.append(("IoU of silhouette and model", f"{iou:.3f}"))
+            numbers.append(("IoU of silhouette and model", f"{outline_iou(depth, mask):.3f}"))
             # Where the model is too large, a photograph shows what is behind the object.
             coloured = torch.where(mask, depth, 0.0)
-        seen.append(HullView(view, image, camera, coloured > 0, coloured, 1.0))
         certain = _largest(probability, coarse_grid, camera, found.placement)
         looked.append(Looked(view, image, camera, depth, certain, "probability", tuple(numbers)))
+        seen.append(looked[-1]._replace(depth=coloured))
     mesh = drop_specks(extract_mesh(fine, fine_grid, level=threshold), SPECK_FACES)
     solid = 100 * float((probability > threshold).float().mean())
     facts = [("voxels", f"{' x '.join(map(str, probability.shape))}, {solid:.1f} % above {threshold:g}")]
     notes: tuple[str, ...] = ()
     if len(mesh.faces):
         mesh = colour_vertices(mesh, seen, 2 * voxel_side(coarse_grid))
-        facts.append(("mesh", f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces"))
     else:
         notes = (
             f"No voxel is more likely solid than {threshold:g}; the largest probability is {probability.max():.2g}.",
         )
     return results._replace(
-        facts=results.facts + tuple(facts), notes=results.notes + notes, views=tuple(looked), mesh=mesh
+        facts=(*results.facts, *facts, *mesh_facts(mesh)), notes=results.notes + notes, views=tuple(looked), mesh=mesh
     )
 
 
@@ -276,7 +275,7 @@ def _with_depth(results: Results, found: Prediction, grid: VoxelGrid, resolution
             numbers.append(("other views that agree", f"{float(support[depth > 0].float().mean()):.1f} on average"))
         looked.append(Looked(view, image, camera, depth, share.float(), "share of views that agree", tuple(numbers)))
         points.append(points_of(depth, camera)[kept].float().numpy())
-        colours.append((image.permute(1, 2, 0)[kept] * 255).round().to(torch.uint8).numpy())
+        colours.append(as_pixels(image)[kept])
     side = min(resolution, FINEST)
     fine = VoxelGrid(side, grid.lower, grid.upper, placement.scene_from_model())
     fused = fuse_depth(
@@ -289,9 +288,7 @@ def _with_depth(results: Results, found: Prediction, grid: VoxelGrid, resolution
     )
     mesh = extract_mesh(fused, fine, specks=SPECK_FACES)
     count = sum(map(len, points))
-    facts = [("kept", f"{count} pixels, {100 * count / maps.numel():.1f} %")]
-    if len(mesh.faces):
-        facts.append(("mesh", f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces"))
+    facts = [("kept", f"{count} pixels, {100 * count / maps.numel():.1f} %"), *mesh_facts(mesh)]
     notes = () if count else ("No depth lies in the cube of the object.",)
     return results._replace(
         facts=results.facts + tuple(facts),
@@ -306,8 +303,7 @@ def _with_depth(results: Results, found: Prediction, grid: VoxelGrid, resolution
 def _largest(probability: Tensor, grid: VoxelGrid, camera: CameraTensors, placement: Placement) -> Tensor:
     """(h, w) the largest probability along each ray, at the camera's size; sampled at a size that voxels need."""
     whole = int(torch.as_tensor(camera.height)), int(torch.as_tensor(camera.width))
-    scale = min(1.0, LARGEST_SAMPLED / max(whole))
-    shape = max(1, round(whole[0] * scale)), max(1, round(whole[1] * scale))
+    shape = fitted(whole, LARGEST_SAMPLED)
     middle = float(in_model_frame(camera, placement).cam_from_world[2, 3])
     planes = torch.linspace(max(middle - REACH, 1e-3), middle + REACH, PLANES, dtype=torch.float64) * placement.side
     maps, _ = plane_sweep_project(probability[None, None], stack([stack([camera])]), grid, planes, shape)

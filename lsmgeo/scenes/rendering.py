@@ -8,12 +8,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_devices, check_geometry, check_number, check_size
+from lsmgeo._checks import check_devices, check_geometry, check_positive, check_size
 from lsmgeo.cameras import as_tensors
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
 from lsmgeo.cameras.tensors import Cameras, check_cameras
 from lsmgeo.cameras.transforms import common_size
-from lsmgeo.errors import DTypeError, OptionError, ShapeError
+from lsmgeo.errors import DTypeError, ShapeError
 from lsmgeo.scenes.inputs import behind, checked_lights
 from lsmgeo.scenes.lighting import Lights, shade
 from lsmgeo.scenes.surfaces import albedo, normals
@@ -101,7 +101,7 @@ def render(
     scenes = check_scenes(who, scenes)
     if dtype not in (torch.float32, torch.float64):
         raise DTypeError(f"{who}: dtype must be torch.float32 or torch.float64; got {dtype}")
-    near = _positive(who, "near", near)
+    near = check_positive(who, "near", near)
     tensors = as_tensors(cameras, who)
     if tensors.intrinsics.dim() != 4 or len(tensors.intrinsics) != len(scenes):
         raise ShapeError(
@@ -254,7 +254,7 @@ def trace(scenes: Sequence[Scene], origins: Tensor, directions: Tensor, *, near:
     """
     who = "trace"
     scenes = check_scenes(who, scenes)
-    near = _positive(who, "near", near)
+    near = check_positive(who, "near", near)
     for name, value in (("origins", origins), ("directions", directions)):
         check_geometry(who, name, value, "(S, N, 3)")
         if value.dim() != 3 or value.shape[0] != len(scenes) or value.shape[2] != 3:
@@ -274,10 +274,3 @@ def trace(scenes: Sequence[Scene], origins: Tensor, directions: Tensor, *, near:
     points[hit] = origins[hit] + distance[hit][:, None] * directions[hit]
     normal[hit] = normals(plan.tables, surface[:, 0][hit].long(), points[hit].T.contiguous()).T
     return Hits(distance, points, normal, hit)
-
-
-def _positive(who: str, name: str, value: float) -> float:
-    number = check_number(who, name, value, "a positive number")
-    if not number > 0:
-        raise OptionError(f"{who}: {name} must be a positive number; got {value!r}")
-    return number

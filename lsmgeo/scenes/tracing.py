@@ -8,7 +8,7 @@ their solids of one kind at once.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -48,16 +48,6 @@ class Plan(NamedTuple):
 
     tables: Tables
     visits: list[Visit]
-
-
-class Rays(Protocol):
-    """Rays of V views, in an (H, W) arrangement."""
-
-    def local(self, rows: list[int], views: list[int], window: Window) -> tuple[Tensor, Tensor, Tensor]:
-        """Local points and directions (M, 3, h, w) of a window's rays, and the ray parameter of the points."""
-
-    def window(self, row: int, view: int) -> Window | None:
-        """Where a solid can be hit; None if nowhere."""
 
 
 def make_plan(scenes: Sequence[Scene], owner: Sequence[int], device: torch.device) -> Plan:
@@ -139,7 +129,7 @@ class CameraRays:
         self.windows = _windows(solids, rows, cameras, views, size, near) if alone else None
 
     def local(self, rows: list[int], views: list[int], window: Window) -> tuple[Tensor, Tensor, Tensor]:
-        """As `Rays.local`."""
+        """Local points and directions (M, 3, h, w) of a window's rays, and the ray parameter of the points."""
         where = [self.index[pair] for pair in zip(rows, views, strict=True)]
         which = slice(where[0], where[0] + 1) if len(where) == 1 else where
         v, u = window
@@ -148,7 +138,7 @@ class CameraRays:
         return point, direction, self.depth[which]
 
     def window(self, row: int, view: int) -> Window | None:
-        """As `Rays.window`."""
+        """Where a solid can be hit; None if nowhere."""
         if self.windows is None:
             return EVERYTHING
         top, bottom, left, right = self.windows[self.index[row, view]]
@@ -189,7 +179,7 @@ class FreeRays:
         self.squared_length = directions.square().sum(1)
 
     def local(self, rows: list[int], views: list[int], window: Window) -> tuple[Tensor, Tensor, Tensor]:
-        """As `Rays.local`; the window is all rays."""
+        """As `CameraRays.local`; the window is all rays."""
         linear, center = self.solids.linear[rows], self.solids.center[rows]
         direction = self.directions[views]
         offset = self.origins[views] - center[:, :, None, None]
@@ -210,7 +200,9 @@ def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:
     return columns[0] * x + columns[1] * y + columns[2] * z
 
 
-def first_hits(plan: Plan, rays: Rays, shape: tuple[int, int, int], near: float, like: Tensor) -> tuple[Tensor, Tensor]:
+def first_hits(
+    plan: Plan, rays: CameraRays | FreeRays, shape: tuple[int, int, int], near: float, like: Tensor
+) -> tuple[Tensor, Tensor]:
     """The nearest surface that each ray enters beyond ``near``.
 
     A solid that holds the point at ``near`` is not seen from within, unless that point lies in one of its cuts.
@@ -242,7 +234,7 @@ def first_hits(plan: Plan, rays: Rays, shape: tuple[int, int, int], near: float,
 
 
 def _enter(
-    solids: Tables, visit: Visit, rays: Rays, window: Window, near: float, dtype: torch.dtype
+    solids: Tables, visit: Visit, rays: CameraRays | FreeRays, window: Window, near: float, dtype: torch.dtype
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Start and end of the rays' first stretch inside solids less their cuts, and the row whose surface begins it."""
 

@@ -148,7 +148,7 @@ def test_wrong_arguments_are_named(scene):
         consistent_views(depth, camera, [depth], [])
     with pytest.raises(ShapeError, match=r"depth must be \(h, w\)"):
         consistent_views(depth[None], camera, [depth], [camera])
-    with pytest.raises(OptionError, match="pixels must be positive; got 0"):
+    with pytest.raises(OptionError, match="pixels must be a positive number; got int 0"):
         consistent_views(depth, camera, [depth], [camera], pixels=0)
-    with pytest.raises(OptionError, match="relative must be positive; got float nan"):
+    with pytest.raises(OptionError, match="relative must be a positive number; got float nan"):
         consistent_views(depth, camera, [depth], [camera], relative=float("nan"))

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from lsmgeo import VoxelGrid, data
+from lsmgeo import VoxelGrid
 from lsmgeo.cameras import CameraTensors
-from lsmgeo.classical.hull_scene import HullView, colour_vertices, hull_depth, reconstruct_hull
+from lsmgeo.classical.hull_scene import colour_vertices, hull_depth
+from lsmgeo.classical.outputs import Looked
 from lsmgeo.data import Mesh
-from lsmgeo.errors import OptionError
-from tests.data.writers import make_scene, write_middlebury
 
 K = torch.tensor([[20.0, 0.0, 7.5], [0.0, 20.0, 5.5], [0.0, 0.0, 1.0]])
 
@@ -41,18 +40,12 @@ def test_a_camera_within_a_hull_sees_what_lies_before_it(z):
     assert bool((depth > 0).all()) == bool((depth > 0).any()) == (0.5 - z > 1.5 / 8)
 
 
-def test_no_views_have_no_hull(tmp_path):
-    read = data.open(write_middlebury(make_scene(), tmp_path))
-    with pytest.raises(OptionError, match="views must name one view at least"):
-        reconstruct_hull(read, [], background="black")
-
-
 @pytest.mark.parametrize("x", [-0.4, 0.0, 7.0, 15.4])
 def test_vertices_take_the_colours_of_pictures_up_to_the_border(x):
     at = torch.linalg.inv(K) @ torch.tensor([x, 5.0, 1.0]) * 2
     vertices = (at.numpy() + 0.01 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])).astype(np.float32)
     mesh = Mesh(vertices, np.array([[0, 2, 1]]))
     picture = torch.tensor([1.0, 0.6, 0.2])[:, None, None].expand(3, 12, 16)
-    view = HullView(0, picture, camera_at(0.0), torch.ones(12, 16) > 0, torch.full((12, 16), 2.0), 1.0)
+    view = Looked(0, picture, camera_at(0.0), torch.full((12, 16), 2.0), torch.ones(12, 16), "silhouette", ())
     coloured = colour_vertices(mesh, [view], 0.1)
     assert coloured.colours[0].tolist() == [255, 153, 51]

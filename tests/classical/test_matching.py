@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from lsmgeo.cameras import CameraTensors
-from lsmgeo.classical import aggregate_views, matching_costs, matching_costs_slabs
+from lsmgeo.classical import aggregate_views, matching_costs
 from lsmgeo.classical.matching import SCORES
 from lsmgeo.errors import CameraError, DTypeError, GridError, OptionError, ShapeError
 from tests.oracle import backproject, is_in_image, pixel_lattice, project, resize_intrinsics, sample
@@ -107,16 +105,6 @@ def test_every_pixel_costs_what_a_loop_says(score, channels, window):
     np.testing.assert_allclose(found.costs.numpy(), expected, rtol=1e-9, atol=1e-10)
 
 
-def test_a_frustum_of_another_size_than_the_images():
-    images, cameras = random_images(1), ugly_cameras()
-    size = (7, 8)
-    expected, seen = expected_costs(images.numpy(), cameras, np.array(DEPTHS), size, "zncc", 3)
-    options: dict[str, Any] = {"size": size, "window": 3, "noise": NOISE}
-    found = matching_costs(images, cameras, torch.tensor(DEPTHS, dtype=torch.float64), **options)
-    np.testing.assert_array_equal(found.visible.numpy(), seen)
-    np.testing.assert_allclose(found.costs.numpy(), expected, rtol=1e-9, atol=1e-10)
-
-
 def test_cameras_of_larger_originals_give_the_same():
     images, cameras = random_images(1), ugly_cameras()
     scale = torch.diag(torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64))
@@ -156,21 +144,6 @@ def test_views_at_once_are_views_alone(score):
         # The mean of the reference, which is taken away, is the same.
         torch.testing.assert_close(together.costs[view - 1 : view], alone.costs, rtol=1e-12, atol=1e-12)
         torch.testing.assert_close(together.visible[view - 1 : view], alone.visible)
-
-
-@pytest.mark.parametrize("score", SCORES)
-@pytest.mark.parametrize("derivatives", [True, False])
-@pytest.mark.parametrize("planes", [1, 2, 5])
-def test_slabs_are_the_whole(score, derivatives, planes):
-    images, depths = random_images(3).float(), torch.linspace(1.3, 2.6, 5)
-    with torch.set_grad_enabled(derivatives):
-        whole = matching_costs(images, ugly_cameras(), depths, score=score)
-        starts = []
-        for start, part in matching_costs_slabs(images, ugly_cameras(), depths, planes, score=score):
-            starts.append(start)
-            torch.testing.assert_close(part.costs, whole.costs[:, start : start + planes], rtol=0, atol=0)
-            torch.testing.assert_close(part.visible, whole.visible[:, start : start + planes])
-    assert starts == list(range(0, 5, planes))
 
 
 def test_correlation_does_not_see_gain_and_offset():
@@ -265,7 +238,6 @@ def test_gradients_flow_through_aggregation():
         ({"window": 4}, OptionError, "window must be odd; got 4"),
         ({"window": 0}, OptionError, "window must be a whole number, at least 1"),
         ({"noise": 0.0}, OptionError, "noise must be a positive number"),
-        ({"size": (0, 4)}, ShapeError, "size must be"),
         ({"images": random_images(1)[0]}, ShapeError, r"images must be \(V, C, h, w\)"),
         ({"images": random_images(1)[:1]}, ShapeError, r"V at least 2; got \(1, 1, 9, 12\)"),
         ({"images": random_images(2)}, ShapeError, "for this score"),

@@ -150,7 +150,6 @@ def test_bad_input_is_refused(tmp_path):
         ({"background": "green"}, "background must be one of"),
         ({"background": (0, 0)}, "background must be"),
         ({"background": (0, 0, 2)}, "background must have numbers"),
-        ({"background": "black", "tolerance": 1.0}, "tolerance"),
         ({"background": "black", "folder": tmp_path}, "not both"),
     ):
         with pytest.raises(OptionError, match=expected):

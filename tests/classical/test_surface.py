@@ -116,7 +116,6 @@ def test_cells_with_an_unseen_corner_have_no_surface():
     assert len(one.faces) == 2
     np.testing.assert_allclose(one.vertices.min(0)[:2], centers[z, 4, 7, :2], atol=1e-6)
     np.testing.assert_allclose(one.vertices.max(0)[:2], centers[z, 5, 8, :2], atol=1e-6)
-    assert len(extract_mesh(seen(centers[..., 2] - 0.013, weight), grid, least_weight=2.0).faces) == 0
 
 
 def test_colours_are_interpolated_from_corners_that_have_any():
@@ -213,7 +212,6 @@ def test_bad_input_is_refused():
         ((field, VoxelGrid(4, world_from_grid=torch.eye(4).repeat(2, 1, 1))), {}, GridError),
         ((field, grid), {"level": float("nan")}, OptionError),
         ((field, grid), {"specks": -1}, OptionError),
-        ((field, grid), {"least_weight": None}, OptionError),
         ((field * float("nan"), grid), {}, OptionError),
     ):
         with pytest.raises(error, match="extract_mesh"):

@@ -152,12 +152,11 @@ def test_views_are_weighted():
     )
     twice = CameraTensors(*(torch.cat((value, value)) for value in camera.tensors()[:2]), 32, 32)
     depths = torch.stack((torch.full((32, 32), 1.9), torch.full((32, 32), 2.1))).double()
-    weights = torch.stack((torch.full((32, 32), 3.0), torch.full((32, 32), 1.0))).double()
     grid = VoxelGrid((40, 1, 1), (-0.01, -0.01, 1.5), (0.01, 0.01, 2.5))
-    fused = fuse_depth(depths, twice, grid, truncation=0.2, weights=weights)
+    fused = fuse_depth(depths, twice, grid, truncation=0.2)
     z = 1.5 + (np.arange(40) + 0.5) / 40
     first, second = 1.9 - z, 2.1 - z
-    w = [k * np.where(d > 0, 1, np.clip(1 + d / 0.2, 0, 1) ** 2) for k, d in ((3, first), (1, second))]
+    w = [np.where(d > 0, 1, np.clip(1 + d / 0.2, 0, 1) ** 2) for d in (first, second)]
     expected = (w[0] * np.minimum(first, 0.2) + w[1] * np.minimum(second, 0.2)) / np.maximum(w[0] + w[1], 1e-30)
     np.testing.assert_allclose(fused.distance.numpy().reshape(-1), expected, atol=1e-6)
     np.testing.assert_allclose(fused.weight.numpy().reshape(-1), w[0] + w[1], rtol=1e-3, atol=1e-6)
@@ -334,8 +333,6 @@ def test_bad_input_is_refused():
         ({"colours": torch.ones(3, 3, 8, 8)}, ShapeError),
         ({"colours": torch.ones(2, 3, 8, 9)}, ShapeError),
         ({"colours": torch.full((3, 3, 8, 9), float("nan"))}, OptionError),
-        ({"weights": torch.ones(3, 9, 8)}, ShapeError),
-        ({"weights": -torch.ones(3, 8, 9)}, OptionError),
         ({"background": torch.ones(3, 8, 9)}, DTypeError),
         ({"truncation": 0.0}, OptionError),
         ({"truncation": float("nan")}, OptionError),

@@ -27,7 +27,7 @@ def some(cameras, views):
     return Cameras(cameras.intrinsics[views], cameras.rotations[views], cameras.translations[views], cameras.size)
 
 
-def expected_support(masks, cameras, points, rule, outside, mode="linear"):
+def expected_support(masks, cameras, points, rule, outside):
     """View by view: what the mask says where the point projects, clamped to the outermost pixels."""
     said, seen = [], []
     for view, mask in enumerate(masks):
@@ -35,7 +35,7 @@ def expected_support(masks, cameras, points, rule, outside, mode="linear"):
         pixels, depth = oracle.project(K, cameras.rotations[view], cameras.translations[view], points)
         sees = (depth > 1e-6) & oracle.is_in_image(pixels, mask.shape)
         pixels = np.where(sees[:, None], pixels, 0.0)
-        said.append(np.where(sees, oracle.sample(mask[None], pixels, mode, "border")[0], np.nan))
+        said.append(np.where(sees, oracle.sample(mask[None], pixels, "linear", "border")[0], np.nan))
         seen.append(sees)
     said, seen = np.array(said), np.array(seen)
     if outside == "empty":
@@ -56,12 +56,10 @@ def test_support_is_what_the_views_say(rule, outside, size):
     masks = np.random.default_rng(2).uniform(size=(4, *size))
     grid = VoxelGrid(SHAPE, LOWER.tolist(), UPPER.tolist(), torch.tensor(POSE))
     points = oracle.voxel_sites(SHAPE, LOWER, UPPER, POSE).reshape(-1, 3)
-    for mode, kind in (("bilinear", "linear"), ("nearest", "nearest")):
-        hull = visual_hull(torch.tensor(masks), cameras.tensors(), grid, rule=rule, outside=outside, mode=mode)
-        expected = expected_support(masks, cameras, points, rule, outside, kind).reshape(SHAPE)
-        np.testing.assert_allclose(hull.support.numpy(), expected, atol=1e-9)
-        threshold = 0.75 if rule == "mean" else 0.5
-        np.testing.assert_array_equal(hull.occupancy.numpy(), expected > threshold)
+    hull = visual_hull(torch.tensor(masks), cameras.tensors(), grid, rule=rule, outside=outside)
+    expected = expected_support(masks, cameras, points, rule, outside).reshape(SHAPE)
+    np.testing.assert_allclose(hull.support.numpy(), expected, atol=1e-9)
+    np.testing.assert_array_equal(hull.occupancy.numpy(), expected > (0.75 if rule == "mean" else 0.5))
     assert 0 < int((hull.support > 0).sum())
 
 
@@ -252,7 +250,6 @@ def test_bad_input_is_refused():
         ({"grid": VoxelGrid(4, world_from_grid=torch.eye(4).repeat(2, 1, 1))}, ShapeError),
         ({"rule": "any"}, OptionError),
         ({"outside": "full"}, OptionError),
-        ({"mode": "cubic"}, OptionError),
         ({"threshold": float("nan")}, OptionError),
         ({"memory": 0}, OptionError),
     ):

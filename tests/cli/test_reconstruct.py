@@ -369,7 +369,7 @@ def test_views_are_chosen_by_angle_and_not_twice(scene, tmp_path):
 
 
 def test_the_default_range_covers_the_scene(scene, folder):
-    near, far = default_depth_range(data.open(folder), 0, [1, 2])
+    near, far = default_depth_range(data.open(folder), 0)
     depth = scene.points @ scene.R[0][2] + scene.t[0][2]
     assert 1.0 < near < depth.min()
     assert depth.max() < far < 3.0

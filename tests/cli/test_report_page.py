@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from lsmgeo.cameras import CameraTensors
-from lsmgeo.classical.report_model import MOST_FACES, Model, _thinned, make_viewer
-from lsmgeo.classical.report_page import ReportPicture, ReportView, make_page
+from lsmgeo.cameras import CameraTensors, select
+from lsmgeo.classical.outputs import Looked, Results
+from lsmgeo.classical.report_model import MOST_FACES, _thinned, make_viewer
+from lsmgeo.classical.report_page import make_page
 from lsmgeo.data import Mesh
 from tests.cli.browser import Browser
 
@@ -41,26 +42,33 @@ def square():
     return Mesh(np.array(vertices, np.float32), np.array(faces), colours=np.array(colours, np.uint8))
 
 
+NOTHING = np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8)
+
+
 def make_views(count, side=120):
     y, x = np.mgrid[:side, : side * 4 // 3]
     depth = np.where(np.hypot(x - 80, y - 60) < 50, 1.0 + x / 160, 0.0)
-    photograph = np.stack([x % 256, y * 2 % 256, 0 * x + 90], -1).astype(np.uint8)
-    pictures = [
-        ReportPicture("photograph", photograph, "photograph"),
-        ReportPicture("depth", depth, "depth", (1.2, 1.8)),
-        ReportPicture("confidence", y / side, "confidence"),
-    ]
-    return [ReportView(view, f"{view} {HOSTILE}", pictures, [("kept", "40 %")]) for view in range(count)]
+    image = np.stack([x % 256, y * 2 % 256, 0 * x + 90]) / 255
+    maps = (torch.from_numpy(values).float() for values in (image, depth, y / side))
+    image, depth, certain = maps
+    numbers = (("kept", "40 %"),)
+    cameras = cameras_around()
+    return tuple(
+        Looked(view, image, select(cameras, 0, 0), depth, certain, "confidence", numbers) for view in range(count)
+    )
+
+
+def results_of(views=(), points=NOTHING, mesh=None, used=(), words=()):
+    return Results(words[0] if words else "page", (words,) if words else (), words[:1], views, *points, mesh, used)
 
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
     mesh = square()
-    model = Model(cameras_around(), (0, 1), mesh, np.array(mesh.vertices), mesh.colours)
+    results = results_of(make_views(3), (np.array(mesh.vertices), mesh.colours), mesh, words=(HOSTILE, HOSTILE))
     path = tmp_path_factory.mktemp("page") / "report.html"
-    path.write_text(
-        make_page(HOSTILE, facts=[(HOSTILE, HOSTILE)], notes=[HOSTILE], views=make_views(3), model=model), "utf-8"
-    )
+    names = [f"{view} {HOSTILE}" for view in range(4)]
+    path.write_text(make_page(results, names, cameras_around()), "utf-8")
     return path
 
 
@@ -154,7 +162,7 @@ def test_the_pictures_are_drawn_and_nothing_is_said_or_asked(browser):
             canvas.width = picture.naturalWidth; canvas.height = picture.naturalHeight;
             const drawing = canvas.getContext("2d", { willReadFrequently: true });
             drawing.drawImage(picture, 0, 0);
-            return [[35, 60], [125, 60], [2, 2]].map(([x, y]) => [...drawing.getImageData(x, y, 1, 1).data]);
+            return [[35, 60], [115, 60], [2, 2]].map(([x, y]) => [...drawing.getImageData(x, y, 1, 1).data]);
         })()"""
     )
     near, far, nothing = depth
@@ -200,18 +208,17 @@ def test_nothing_in_the_page_names_another_place(page):
 
 
 def test_fifty_views_make_a_page_of_limited_size():
-    noise = np.random.default_rng(0).integers(0, 256, (600, 800, 3)).astype(np.uint8)
-    pictures = [
-        ReportPicture("photograph", noise, "photograph"),
-        ReportPicture("confidence", noise[..., 0] / 255, "confidence"),
-    ]
-    text = make_page("many", views=[ReportView(view, str(view), pictures, []) for view in range(50)])
+    generator = torch.Generator().manual_seed(0)
+    noise = [torch.rand(shape, generator=generator) for shape in ((3, 600, 800), (600, 800), (600, 800))]
+    camera = select(cameras_around(), 0, 0)
+    views = tuple(Looked(view, noise[0], camera, *noise[1:], "confidence", ()) for view in range(50))
+    text = make_page(results_of(views), [str(view) for view in range(50)], cameras_around(50))
     assert len(text) < 20e6
     assert text.count("<section") == 50
 
 
 def test_a_page_without_a_model_has_no_frame_for_one():
-    assert "<iframe" not in make_page("nothing", notes=["no pixel was kept"])
+    assert "<iframe" not in make_page(results_of(make_views(1)), ["nothing"], cameras_around(1))
 
 
 def test_surfaces_of_many_faces_are_thinned():
@@ -235,7 +242,5 @@ def test_surfaces_of_many_faces_are_thinned():
 
 def test_points_alone_make_a_model():
     rng = np.random.default_rng(0)
-    model = Model(
-        cameras_around(), (2,), None, rng.normal(size=(100, 3)), rng.integers(0, 256, (100, 3)).astype(np.uint8)
-    )
-    assert "$B64GLTF" not in make_viewer(model)
+    points = rng.normal(size=(100, 3)), rng.integers(0, 256, (100, 3)).astype(np.uint8)
+    assert "$B64GLTF" not in make_viewer(results_of(make_views(1), points), cameras_around())

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from lsmgeo.diagnosis.geometry import Geometry
 from lsmgeo.diagnosis.outlines import epipolar_tangency, outline
 
 # An ellipsoid, X = A u + b with |u| = 1: no mirror symmetry, so that mirrored cameras show.
@@ -47,9 +48,15 @@ CAMERAS = [camera(eye, 0.4 * index) for index, eye in enumerate(EYES)]
 OUTLINES = [exact_outline(*camera) for camera in CAMERAS]
 
 
+def both(first, second):
+    (K1, E1), (K2, E2) = first, second
+    E = np.stack([E1, E2])
+    return Geometry(np.stack([K1, K2]), E[:, :3, :3], E[:, :3, 3])
+
+
 def residuals(cameras, outlines=OUTLINES):
     pairs = itertools.combinations(range(len(cameras)), 2)
-    return np.concatenate([epipolar_tangency(outlines[i], outlines[j], (*cameras[i], *cameras[j])) for i, j in pairs])
+    return np.concatenate([epipolar_tangency(outlines[i], outlines[j], both(cameras[i], cameras[j])) for i, j in pairs])
 
 
 def test_outlines_of_one_object_touch_the_same_planes():
@@ -61,7 +68,7 @@ def test_outlines_of_one_object_touch_the_same_planes():
 def test_an_error_is_as_large_as_the_outline_is_shifted():
     K, E = CAMERAS[1]
     for first, second in itertools.permutations(range(len(CAMERAS)), 2):
-        cameras = (*CAMERAS[first], *CAMERAS[second])
+        cameras = both(CAMERAS[first], CAMERAS[second])
         center = -np.linalg.solve(CAMERAS[first][1][:3, :3], CAMERAS[first][1][:3, 3])
         K, E = CAMERAS[second]
         pixel = K @ (E[:3, :3] @ center + E[:3, 3])
@@ -108,8 +115,8 @@ def test_the_world_may_be_moved_mirrored_and_scaled():
 
 def test_nothing_is_said_where_the_baseline_meets_the_object():
     first, second = camera((2.0, 0.1, 0.0), 0.0), camera((-2.0, 0.1, 0.0), 0.0)
-    assert np.isnan(epipolar_tangency(exact_outline(*first), exact_outline(*second), (*first, *second))).all()
-    same = epipolar_tangency(OUTLINES[0], OUTLINES[0], (*CAMERAS[0], *CAMERAS[0]))
+    assert np.isnan(epipolar_tangency(exact_outline(*first), exact_outline(*second), both(first, second))).all()
+    same = epipolar_tangency(OUTLINES[0], OUTLINES[0], both(CAMERAS[0], CAMERAS[0]))
     assert np.isnan(same).all()
 
 

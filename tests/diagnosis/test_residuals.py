@@ -8,10 +8,9 @@ import torch
 
 from lsmgeo.data.posed import Observations, SparsePoints, Voxels
 from lsmgeo.diagnosis.epipolar import in_front, pair_distances, residuals, sampson_distances
-from lsmgeo.diagnosis.findings import Check
+from lsmgeo.diagnosis.findings import Check, badness
 from lsmgeo.diagnosis.geometry import Geometry, Hypothesis
 from lsmgeo.diagnosis.half_pixel import find_shifts
-from lsmgeo.diagnosis.limits import badness
 from lsmgeo.diagnosis.matching import Matches, choose_views
 from lsmgeo.diagnosis.orders import assigned, named_orders, search_order
 from lsmgeo.diagnosis.silhouettes import Silhouettes, Solid, near_cells, overlap, within_a_cell

@@ -27,7 +27,7 @@ def test_options_exist():
 
 def test_defaults_are_as_said():
     assert re.search(r"300\s+planes", GUIDE)
-    assert OPTIONS["planes"].default == default(classical.reconstruct_view, "planes") == 300
+    assert OPTIONS["planes"].default == default(classical.reconstruct_scene, "planes") == 300
     assert OPTIONS["size"].default == 640
     assert (default(classical.reconstruct_view, "density"), default(classical.reconstruct_scene, "density")) == (
         0.4,

@@ -153,7 +153,7 @@ def test_errors_name_the_argument():
         category_means([0.1, 0.2], ["car"])
     with pytest.raises(DTypeError, match=r"VoxelIoU.update: categories must be names; got NoneType None"):
         VoxelIoU().update(predicted, truth, ["car", None])
-    with pytest.raises(OptionError, match=r"VoxelIoU.merge: other must have threshold"):
+    with pytest.raises(OptionError, match=r"VoxelIoU.merge: other must have the options"):
         VoxelIoU().merge(VoxelIoU(threshold=0.75))
     with pytest.raises(OptionError, match=r"DepthError.merge: other must have"):
         DepthError().merge(DepthError(rule="release"))

@@ -13,7 +13,6 @@ from lsmgeo.cameras import CameraTensors
 from lsmgeo.data import sources
 from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.scenes import synthetic13
-from lsmgeo.scenes.synthetic13 import __main__ as program
 from lsmgeo.scenes.synthetic13.parameters import Parameters, random_palette
 
 CATEGORIES = tuple(synthetic13.CATEGORIES)
@@ -398,11 +397,3 @@ def test_impossible_requests():
         synthetic13.views(0, 0, 0, 64)
     with pytest.raises(ShapeError, match="at least 2"):
         synthetic13.measure("chair", count=1)
-
-
-def test_the_table(capsys, monkeypatch):
-    monkeypatch.setattr("sys.argv", ["synthetic13", "2"])
-    program.main()
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines[2:]] == list(CATEGORIES)
-    assert all(0 <= float(line.split()[-1]) <= 1 for line in lines[2:])

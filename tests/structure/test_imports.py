@@ -37,14 +37,17 @@ MAY_IMPORT = {
     "fusion": SHARED | {"functional", "kernels"},
     "rays": SHARED | {"functional", "grids", "kernels", "_sites"},
 }
-OUTSIDE_THE_CORE = {"models", "data", "classical", "scenes", "metrics", "cli", "commands", "demo", "diagnosis"}
+OUTSIDE_THE_CORE = {
+    "models", "data", "classical", "scenes", "metrics", "cli", "commands", "demo", "diagnosis", "drawing",
+}  # fmt: skip
 # What the parts outside may import of each other; the core is open to all of them.
 MAY_ALSO_IMPORT = {
     "scenes": set(),
     "data": {"scenes"},
     "metrics": set(),
-    "diagnosis": {"data"},
-    "models": {"data", "scenes", "metrics", "classical"},
+    "drawing": {"data"},
+    "diagnosis": {"data", "drawing"},
+    "models": {"data", "scenes", "metrics", "drawing", "classical"},
 }
 NETWORKS = {
     "blocks", "creating", "depth_lsm", "grid_unet", "image_encoder", "losses", "machine", "model", "outputs", "r2n2",

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lsmgeo.models.evaluation.contenders import Contender, pick
-from lsmgeo.models.evaluation.facts import facts_of
 from lsmgeo.models.evaluation.iou import measure_iou
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.paper import IOU, paper_row
 from lsmgeo.models.evaluation.plots import Curve, draw_curves
-from lsmgeo.models.evaluation.report import Report, Row, Table
+from lsmgeo.models.evaluation.report import Report, Row, Table, facts_of
 from lsmgeo.models.evaluation.scores import Scores, joined
 from lsmgeo.models.evaluation.shapes import Shapes
 

@@ -12,18 +12,15 @@ from lsmgeo.cameras import CameraTensors, select
 from lsmgeo.classical.reconstruct import points_of
 from lsmgeo.data import Batch
 from lsmgeo.data.sample import first_views
+from lsmgeo.drawing import Picture, as_pixels, draw_depth, draw_points
 from lsmgeo.errors import OptionError
 from lsmgeo.metrics import depth_errors, point_cloud_scores
-from lsmgeo.models.evaluation.contenders import Contender, pick
-from lsmgeo.models.evaluation.depth import one_size
-from lsmgeo.models.evaluation.facts import facts_of
+from lsmgeo.models.evaluation.baselines import SWEEP, sweep_views
+from lsmgeo.models.evaluation.contenders import Contender, one_size, pick
 from lsmgeo.models.evaluation.options import Options
-from lsmgeo.models.evaluation.plane_sweeps import SWEEP, sweep_views
 from lsmgeo.models.evaluation.plots import sheet
-from lsmgeo.models.evaluation.report import Cell, Report, Row, Table
-from lsmgeo.models.evaluation.sequences import as_picture
+from lsmgeo.models.evaluation.report import Cell, Report, Row, Table, facts_of
 from lsmgeo.models.evaluation.shapes import Shapes, SizedShapes, batches
-from lsmgeo.models.pictures import Picture, draw_depth, draw_points
 
 __all__ = ["joint_cloud", "report_clouds"]
 
@@ -116,8 +113,8 @@ def joint_cloud(depth: Tensor, images: Tensor, cameras: CameraTensors) -> tuple[
     for view, one in enumerate(depth):
         there = one > 0
         positions.append(points_of(one, select(cameras, 0, view))[there])
-        colours.append((images[view].permute(1, 2, 0)[there].clamp(0, 1) * 255).round().byte())
-    return torch.cat(positions).numpy(), torch.cat(colours).numpy()
+        colours.append(as_pixels(images[view])[there])
+    return torch.cat(positions).numpy(), np.concatenate(colours)
 
 
 def _draw(
@@ -135,7 +132,7 @@ def _draw(
         if name == TRUTH:
             shaded[1:] = [None] * len(shaded[1:])  # the first view's is the same
         drawn = [draw_points(*clouds[name, count], size=SIDE) for count in counts]
-        rows.append([as_picture(batch.images[0, 0], SIDE) if name == TRUTH else None, *shaded, *drawn])
+        rows.append([as_pixels(batch.images[0, 0], SIDE) if name == TRUTH else None, *shaded, *drawn])
     columns = ["first view"]
     columns += [f"depth, {count} views" for count in counts] + [f"points, {count} views" for count in counts]
     return sheet(rows, methods, columns, title=f"{shape}: depth of the first view from aside; all points together")

@@ -17,7 +17,7 @@ from lsmgeo.errors import OptionError
 from lsmgeo.models.evaluation.shapes import resized
 from lsmgeo.scenes.synthetic13 import CLASS_SPLITS
 
-__all__ = ["Contender", "Training", "one_resolution", "open_contenders", "pick"]
+__all__ = ["Contender", "Training", "one_resolution", "one_size", "open_contenders", "pick"]
 
 TITLES = {"voxel-lsm": "V-LSM", "depth-lsm": "D-LSM", "r2n2": "3D-R2N2", "r2n2-pose": "3D-R2N2 w/pose"}
 
@@ -205,7 +205,19 @@ def one_resolution(contenders: Sequence[Contender]) -> int:
     Raises:
         OptionError: they differ.
     """
-    found = {contender.name: contender.resolution for contender in contenders}
+    return _one_of({contender.name: contender.resolution for contender in contenders}, "resolution of voxels")
+
+
+def one_size(contenders: Sequence[Contender]) -> int:
+    """Height and width of the pictures that all take.
+
+    Raises:
+        OptionError: they differ.
+    """
+    return _one_of({contender.name: contender.size for contender in contenders}, "size of pictures")
+
+
+def _one_of(found: Mapping[str, int], words: str) -> int:
     if len(set(found.values())) != 1:
-        raise OptionError(f"evaluate: models must have one resolution of voxels; got {found}")
+        raise OptionError(f"evaluate: models must have one {words}; got {found}")
     return next(iter(found.values()))

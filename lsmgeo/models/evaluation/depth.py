@@ -9,19 +9,17 @@ from torch import Tensor
 
 from lsmgeo.cameras import select
 from lsmgeo.data import Batch
+from lsmgeo.drawing import Picture, as_pixels, draw_depth
 from lsmgeo.errors import OptionError
 from lsmgeo.metrics import depth_errors, median_depth_error
-from lsmgeo.models.evaluation.contenders import Contender, pick
-from lsmgeo.models.evaluation.facts import facts_of
+from lsmgeo.models.evaluation.baselines import SURE, SWEEP, Swept, sweep_views
+from lsmgeo.models.evaluation.contenders import Contender, one_size, pick
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.paper import DEPTH, paper_categories
-from lsmgeo.models.evaluation.plane_sweeps import SURE, SWEEP, Swept, sweep_views
 from lsmgeo.models.evaluation.plots import sheet
-from lsmgeo.models.evaluation.report import Cell, Report, Row, Table
+from lsmgeo.models.evaluation.report import Cell, Report, Row, Table, facts_of
 from lsmgeo.models.evaluation.scores import Scores, joined
-from lsmgeo.models.evaluation.sequences import as_picture
 from lsmgeo.models.evaluation.shapes import Shapes, SizedShapes, batches
-from lsmgeo.models.pictures import Picture, draw_depth
 
 __all__ = ["report_depth"]
 
@@ -98,18 +96,6 @@ def report_depth(contenders: Sequence[Contender], shapes: Shapes, options: Optio
     )
 
 
-def one_size(contenders: Sequence[Contender]) -> int:
-    """Height and width of the pictures that all take.
-
-    Raises:
-        OptionError: they differ.
-    """
-    found = {contender.name: contender.size for contender in contenders}
-    if len(set(found.values())) != 1:
-        raise OptionError(f"evaluate: depth models must take pictures of one size; got {found}")
-    return next(iter(found.values()))
-
-
 def _errors(predicted: Tensor, depth: Tensor, mask: Tensor, swept: Swept) -> Tensor:
     """The measures (B, 7) of depth maps (B, V, H, W): means over the views that have a pixel that counts."""
     on = mask & (depth > 0)
@@ -133,7 +119,7 @@ def _draw(batch: Batch, place: int, depths: Sequence[Tensor]) -> list[Picture | 
     assert batch.mask is not None
     camera, on = select(select(batch.cameras, 0, place), 0, 0), batch.mask[place, 0]
     surfaces = [torch.where(on, depth[place, 0].float(), 0.0) for depth in (batch.depth, *depths)]
-    return [as_picture(batch.images[place, 0], SIDE), *(draw_depth(one, camera, size=SIDE) for one in surfaces)]
+    return [as_pixels(batch.images[place, 0], SIDE), *(draw_depth(one, camera, size=SIDE) for one in surfaces)]
 
 
 def _percent(cell: Cell) -> Cell:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from lsmgeo.data.backgrounds import Background
+from lsmgeo.models.evaluation.baselines import HULL, STRICT_HULL, hull_iou
 from lsmgeo.models.evaluation.contenders import Contender, one_resolution, pick
-from lsmgeo.models.evaluation.facts import facts_of
-from lsmgeo.models.evaluation.hulls import HULL, STRICT_HULL, hull_iou
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.paper import IOU, IOU_OF_CATEGORIES, paper_categories, paper_row
 from lsmgeo.models.evaluation.plots import Curve, draw_curves
-from lsmgeo.models.evaluation.report import Cell, Report, Row, Table
+from lsmgeo.models.evaluation.report import Cell, Report, Row, Table, facts_of
 from lsmgeo.models.evaluation.scores import Scores, iou_by_view, joined
 from lsmgeo.models.evaluation.shapes import Shapes, batches
 

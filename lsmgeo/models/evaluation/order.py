@@ -9,10 +9,9 @@ from torch import Tensor
 
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.models.evaluation.contenders import Contender, one_resolution, pick
-from lsmgeo.models.evaluation.facts import facts_of
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.plots import Curve, draw_curves
-from lsmgeo.models.evaluation.report import Cell, Report, Row, Table
+from lsmgeo.models.evaluation.report import Cell, Report, Row, Table, facts_of
 from lsmgeo.models.evaluation.scores import Scores, iou_by_view
 from lsmgeo.models.evaluation.shapes import ORDER, Shapes, batches, generator_of
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from math import isnan
 from typing import NamedTuple
 
+from lsmgeo.drawing import Picture, as_png, new_figure, tile
 from lsmgeo.models.evaluation.report import Cell
-from lsmgeo.models.pictures import Picture, tile
 
 __all__ = ["Curve", "draw_curves", "sheet"]
 
@@ -46,11 +45,7 @@ def draw_curves(
         up: what the values are, with units.
         bars: what the bars are, where there are any.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 4.2), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(7.0, 4.2, dpi=DPI)
     axes = figure.add_subplot()
     own = [curve.name for curve in curves if not curve.is_elsewhere]
     colour = {name: COLOURS[place % len(COLOURS)] for place, name in enumerate(own)}
@@ -74,7 +69,7 @@ def draw_curves(
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    return _png(figure)
+    return as_png(figure)
 
 
 def sheet(
@@ -92,15 +87,11 @@ def sheet(
         columns: of the columns, one each.
         title: to write above.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     pixels = tile(rows, gap=GAP)
     side = next(picture for row in rows for picture in row if picture is not None).shape[0]
     margin = NAMES + 7 * max(len(name) for name in names)  # pixels, of letters about so wide
     width, height = margin + pixels.shape[1] + GAP, TOP + pixels.shape[0] + GAP
-    figure = Figure(figsize=(width / 100, height / 100), dpi=100)
-    FigureCanvasAgg(figure)
+    figure = new_figure(width / 100, height / 100, layout="none")
     figure.text(margin / width, 1 - 14 / height, title, fontsize=10, va="center")
     for place, name in enumerate(names):
         middle = TOP + place * (side + GAP) + side / 2
@@ -110,10 +101,4 @@ def sheet(
         figure.text(middle / width, 1 - (TOP - 10) / height, name, fontsize=8, ha="center", va="center")
     # Pixel for pixel, from the lower left corner.
     figure.figimage(pixels, margin, GAP, origin="upper")
-    return _png(figure)
-
-
-def _png(figure: object) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")  # type: ignore[attr-defined]
-    return buffer.getvalue()
+    return as_png(figure)

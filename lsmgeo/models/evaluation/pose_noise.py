@@ -9,12 +9,11 @@ from torch import Tensor
 
 from lsmgeo.cameras import CameraTensors, perturb, select, stack
 from lsmgeo.data import Batch
+from lsmgeo.models.evaluation.baselines import HULL, hull_iou
 from lsmgeo.models.evaluation.contenders import Contender, one_resolution, pick
-from lsmgeo.models.evaluation.facts import facts_of
-from lsmgeo.models.evaluation.hulls import HULL, hull_iou
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.plots import Curve, draw_curves
-from lsmgeo.models.evaluation.report import Report, Row, Table
+from lsmgeo.models.evaluation.report import Report, Row, Table, facts_of
 from lsmgeo.models.evaluation.scores import Scores, iou_by_view, joined
 from lsmgeo.models.evaluation.shapes import Shapes, batches, noise_of
 

@@ -10,13 +10,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from lsmgeo.data import write_atomic, write_point_cloud
 
-__all__ = ["Cell", "Report", "Row", "Table", "finite", "format_table", "write_report"]
+if TYPE_CHECKING:
+    from lsmgeo.models.evaluation.contenders import Contender
+    from lsmgeo.models.evaluation.options import Options
+    from lsmgeo.models.evaluation.shapes import Shapes
+
+__all__ = ["Cell", "Report", "Row", "Table", "facts_of", "finite", "format_table", "write_report"]
 
 MARK = "*"
 
@@ -77,6 +82,28 @@ class Report:
     pictures: Mapping[str, bytes] = field(default_factory=dict)
     clouds: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
     notes: Sequence[str] = ()
+
+
+def facts_of(contenders: Sequence[Contender], shapes: Shapes, options: Options, **settings: Any) -> dict[str, Any]:
+    """The data, the models and the settings of a report, as JSON can hold them.
+
+    Args:
+        contenders: the models.
+        shapes: what was evaluated on.
+        options: the seed.
+        settings: what else the figures depend on.
+    """
+    models = [
+        {
+            "name": contender.name,
+            "network": contender.kind,
+            "path": contender.path,
+            "trained on": contender.training.words or "all categories, white",
+            "parameters": sum(parameter.numel() for parameter in contender.model.parameters()),
+        }
+        for contender in contenders
+    ]
+    return {"data": shapes.about, "models": models, "seed": options.seed, **settings}
 
 
 def format_table(table: Table) -> str:
@@ -157,41 +184,34 @@ def _as_csv(tables: Sequence[Table]) -> str:
 
 def _plain(report: Report) -> dict[str, Any]:
     """A report without its pictures and clouds, as JSON can hold it."""
-    tables = [
-        {
-            "key": table.key,
-            "title": table.title,
-            "footnote": table.footnote,
-            "columns": list(table.columns),
-            "rows": [
-                {
-                    "name": row.name,
-                    "other_data": row.is_elsewhere,
-                    "values": [None if cell is None else _number(cell.value) for cell in row.cells],
-                    "standard_errors": [None if cell is None else _number(cell.error) for cell in row.cells],
-                }
-                for row in table.rows
-            ],
-        }
-        for table in report.tables
-    ]
+    tables = []
+    for table in report.tables:
+        rows = [
+            {
+                "name": row.name,
+                "other_data": row.is_elsewhere,
+                "values": [None if cell is None else cell.value for cell in row.cells],
+                "standard_errors": [None if cell is None else cell.error for cell in row.cells],
+            }
+            for row in table.rows
+        ]
+        told = {"key": table.key, "title": table.title, "footnote": table.footnote}
+        tables.append({**told, "columns": list(table.columns), "rows": finite(rows)})
     return {
         "report": report.name,
         "facts": dict(report.facts),
         "notes": list(report.notes),
         "tables": tables,
-        "shapes": [finite(shape) for shape in report.shapes],
+        "shapes": finite(list(report.shapes)),
     }
 
 
 def finite(value: Any) -> Any:
-    """The same with None for every number that JSON has not."""
+    """The same with nine digits, and None for every number that JSON has not."""
     if isinstance(value, Mapping):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [finite(item) for item in value]
-    return _number(value) if isinstance(value, float) else value
-
-
-def _number(value: float) -> float | None:
-    return round(value, 9) if math.isfinite(value) else None
+    if isinstance(value, float):
+        return round(value, 9) if math.isfinite(value) else None
+    return value

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-import torch
 from torch import Tensor
 
+from lsmgeo.drawing import Picture, as_pixels, draw_voxels
 from lsmgeo.models.evaluation.contenders import Contender, one_resolution, pick
-from lsmgeo.models.evaluation.facts import facts_of
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.plots import sheet
-from lsmgeo.models.evaluation.report import Report, Row, Table
+from lsmgeo.models.evaluation.report import Report, Row, Table, facts_of
 from lsmgeo.models.evaluation.scores import Scores, iou_by_view, joined
 from lsmgeo.models.evaluation.shapes import Shapes, batches
-from lsmgeo.models.pictures import Picture, draw_voxels
 
-__all__ = ["as_picture", "report_sequences"]
+__all__ = ["report_sequences"]
 
 VIEWS = 4
 SIDE = 256
@@ -72,13 +69,7 @@ def report_sequences(contenders: Sequence[Contender], shapes: Shapes, options: O
 def _draw(images: Tensor, solids: dict[str, Tensor], truth: Tensor, shape: str) -> bytes:
     views = len(images)
     true = draw_voxels(truth, size=SIDE)
-    rows: list[list[Picture | None]] = [[*(as_picture(image, SIDE) for image in images), true]]
+    rows: list[list[Picture | None]] = [[*(as_pixels(image, SIDE) for image in images), true]]
     rows += [[draw_voxels(solid, size=SIDE) for solid in by_view] + [None] for by_view in solids.values()]
     columns = [f"view {view}" for view in range(1, views + 1)]
     return sheet(rows, ["views", *solids], [*columns, "truth"], title=f"{shape}: after each view")
-
-
-def as_picture(image: Tensor, side: int) -> Picture:
-    """A picture (3, h, w) as (side, side, 3) uint8."""
-    smooth = torch.nn.functional.interpolate(image[None].float(), (side, side), mode="bilinear", antialias=True)[0]
-    return np.asarray((smooth.clamp(0, 1) * 255).round().byte().permute(1, 2, 0))

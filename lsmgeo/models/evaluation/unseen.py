@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 
 from lsmgeo.errors import OptionError
 from lsmgeo.models.evaluation.contenders import Contender, pick
-from lsmgeo.models.evaluation.facts import facts_of
 from lsmgeo.models.evaluation.iou import measure_iou
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.plots import Curve, draw_curves
-from lsmgeo.models.evaluation.report import Report, Row, Table
+from lsmgeo.models.evaluation.report import Report, Row, Table, facts_of
 from lsmgeo.models.evaluation.scores import Scores, joined
 from lsmgeo.models.evaluation.shapes import Shapes
 

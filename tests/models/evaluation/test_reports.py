@@ -13,7 +13,7 @@ import torch
 from lsmgeo.cameras import orbit, rays
 from lsmgeo.errors import OptionError
 from lsmgeo.models.evaluation import Contender, Options, Training, evaluate, format_table, write_report
-from lsmgeo.models.evaluation.plane_sweeps import Swept, sweep_views
+from lsmgeo.models.evaluation.baselines import Swept, sweep_views
 from tests.models.evaluation.fakes import SIZE, FakeDepths, FakeShapes, FakeVoxels, iou
 
 # Three chairs and one lamp: a mean over shapes is not the mean of the categories.

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from lsmgeo.cameras import orbit
+from lsmgeo.drawing import draw_depth, draw_points, draw_voxels, tile
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
-from lsmgeo.models.pictures import draw_depth, draw_points, draw_voxels, tile
 
 
 def covered(picture):
@@ -73,13 +73,9 @@ def test_depth_is_drawn_where_it_is():
 
 def test_a_shifted_viewer_goes_to_the_right_and_up():
     depth, camera = plane()
-    depth[14:26, 14:26] = (
-        1.7  # a nearer plate before the middle: of a viewer to the right and above it moves left and down
-    )
-    colours = torch.zeros(3, 40, 40)
-    colours[0, 15:24, 15:24] = 1.0  # of quads, whose middle is the picture's
-    picture = draw_depth(depth, camera, turn=25.0, lift=20.0, size=100, colours=colours, reach=1.0).astype(int)
-    row, column = np.argwhere(picture[..., 0] - picture[..., 1] > 60).mean(0)
+    depth[:] = 0
+    depth[15:25, 15:25] = 1.7  # a plate before the middle: of a viewer to the right and above it moves left and down
+    row, column = covered(draw_depth(depth, camera, turn=25.0, lift=20.0, size=100, reach=1.0)).mean(0)
     a, e = np.radians([25, 20])
     expected = [49.5 - 50 * 0.3 * np.sin(a), 49.5 + 50 * 0.3 * np.cos(a) * np.sin(e)]
     np.testing.assert_allclose([column, row], expected, atol=0.7)

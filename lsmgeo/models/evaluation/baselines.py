@@ -1,4 +1,4 @@
-"""Plane-sweep stereo of all views of a shape, as a method beside the models."""
+"""What stands beside the models: the visual hull of the first views, and plane-sweep stereo of all views of a shape."""
 
 from __future__ import annotations
 
@@ -9,15 +9,35 @@ import torch
 from torch import Tensor
 
 from lsmgeo.cameras import CameraTensors
-from lsmgeo.classical import sweep, sweep_planes
+from lsmgeo.classical import sweep, sweep_planes, visual_hull
+from lsmgeo.data.sample import first_views
+from lsmgeo.grids import VoxelGrid
+from lsmgeo.models.evaluation.scores import iou_by_view
 
-__all__ = ["SURE", "SWEEP", "Swept", "sweep_views"]
+__all__ = ["HULL", "STRICT_HULL", "SURE", "SWEEP", "Swept", "hull_iou", "sweep_views"]
 
-SWEEP = "plane sweep"
+HULL, STRICT_HULL, SWEEP = "visual hull", "visual hull, strict", "plane sweep"
 # The confidence from which a depth is more than the best of many bad ones.
 SURE = 0.05
 # All that an object in the unit cube can be at, seen from 2 units away.
 NEAR, FAR = 2 - math.sqrt(3) / 2, 2 + math.sqrt(3) / 2
+
+
+def hull_iou(masks: Tensor, cameras: CameraTensors, occupancy: Tensor, *, rule: str = "mean") -> Tensor:
+    """IoU (B, V) of the hull of the first views, after each.
+
+    Args:
+        masks: (B, V, H, W) bool silhouettes.
+        cameras: leading shape (B, V).
+        occupancy: (B, D, H, W) bool over the unit cube, the truth.
+        rule: "mean" above 0.75, as in the paper, or "all": strictly within all silhouettes.
+    """
+    grid = VoxelGrid(tuple(occupancy.shape[1:]))  # type: ignore[arg-type]
+    hulls = [
+        visual_hull(masks[:, :views], first_views(cameras, views), grid, rule=rule).occupancy
+        for views in range(1, masks.shape[1] + 1)
+    ]
+    return iou_by_view(torch.stack(hulls, 1), occupancy)
 
 
 class Swept(NamedTuple):

@@ -19,8 +19,7 @@ from lsmgeo.cameras import orbit
 from lsmgeo.layers import PlaneSweepProject, Unproject
 from lsmgeo.models import create
 from lsmgeo.models.blocks import Block, Convolution, InstanceNorm
-from lsmgeo.models.grid_unet import GridUNet
-from lsmgeo.models.image_encoder import ImageEncoder
+from lsmgeo.models.voxel_lsm import GridUNet, ImageEncoder
 from lsmgeo.rays import ProjectReduce
 
 VIEWS = 2

@@ -1,9 +1,9 @@
 """The learnt machines: V-LSM, D-LSM and the baseline 3D-R2N2, their losses and weights."""
 
+from lsmgeo.models.blocks import Model
 from lsmgeo.models.creating import create, from_settings, settings_of
 from lsmgeo.models.depth_lsm import DepthLSM
 from lsmgeo.models.losses import compute_loss, sum_loss
-from lsmgeo.models.model import Model
 from lsmgeo.models.outputs import DepthOutput, DepthResult, VoxelOutput, VoxelResult
 from lsmgeo.models.r2n2 import R2N2, R2N2Settings
 from lsmgeo.models.settings import DepthSettings, MachineSettings, VoxelSettings

@@ -1,14 +1,33 @@
-"""What the networks are made of: convolutions that keep sizes whole, instance norm, and the block of both."""
+"""What the networks are made of: convolutions that keep sizes whole, instance norm, and what every model has."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from types import MappingProxyType
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, conv3d, conv_transpose2d, conv_transpose3d, group_norm, pad
 
-__all__ = ["Block", "Convolution", "InstanceNorm", "interleave"]
+from lsmgeo._checks import check_flag
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes
+from lsmgeo.errors import ShapeError
+from lsmgeo.grids import VoxelGrid
+from lsmgeo.models.outputs import VoxelResult
+
+__all__ = [
+    "Block",
+    "Convolution",
+    "InstanceNorm",
+    "Model",
+    "VoxelModel",
+    "evaluating",
+    "interleave",
+    "moved_center",
+    "views_of",
+]
 
 
 class Convolution(nn.Module):
@@ -170,3 +189,99 @@ def interleave(parts: Tensor, factor: int) -> Tensor:
     x = parts.unflatten(1, (factor, factor, factor))  # (N, z, y, x, D, H, W)
     x = x.permute(0, 4, 1, 5, 2, 6, 3)
     return x.flatten(5, 6).flatten(3, 4).flatten(1, 2)[:, None]
+
+
+class Model(nn.Module):
+    """Base class of the models.
+
+    Attributes:
+        name: by which `lsmgeo.models.create` knows it.
+        settings: what it was built from, a frozen dataclass that JSON can hold.
+        output: "voxels" or "depth".
+        image_size: side in pixels of the square images that it is meant for.
+        resolution: voxels along a side of its finest grid.
+        grid: that grid.
+        prefers_channels_last: whether it trains faster on CPUs with maps kept pixel by pixel in memory.
+        about: the notes of the file that it was loaded from.
+    """
+
+    name: str
+    settings: Any
+    output: str
+    image_size: int
+    resolution: int
+    grid: VoxelGrid
+    prefers_channels_last = False
+    about: Mapping[str, Any] = MappingProxyType({})
+
+
+class VoxelModel(Model):
+    """Base class of those that give occupancy."""
+
+    output = "voxels"
+
+    def run(
+        self, images: Tensor, cameras: Cameras, view_mask: Tensor | None = None, *, by_view: bool = True
+    ) -> VoxelResult:
+        """Probabilities of occupancy, in evaluation mode and without gradients.
+
+        Args:
+            images: (B, V, 3, H, W) in [0, 1].
+            cameras: B*V cameras.
+            view_mask: (B, V) bool.
+            by_view: whether to tell what is known after every view too, at V times the work of the last networks.
+
+        Returns:
+            `VoxelResult`, float32.
+
+        Raises:
+            ShapeError, DTypeError, DeviceError, CameraError, OptionError: see `lsmgeo.errors`.
+        """
+        check_flag(self.name, "by_view", by_view)
+        with evaluating(self):
+            logits = self(images, cameras, view_mask, steps=None if by_view else "last").logits
+            occupancy = logits.float().sigmoid()
+        return VoxelResult(occupancy[:, -1], occupancy if by_view else None)
+
+
+@contextmanager
+def evaluating(model: nn.Module) -> Iterator[None]:
+    """Evaluation mode and no gradients inside; the mode before, after."""
+    was_training = model.training
+    model.eval()
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        model.train(was_training)
+
+
+def moved_center(who: str, cameras: Cameras, pixels: float) -> CameraTensors:
+    """Move the principal points of cameras.
+
+    Args:
+        who: the model that asks, named in errors.
+        cameras: of any leading shape.
+        pixels: of the image, to the right and down.
+
+    Returns:
+        Cameras of the same leading shape.
+    """
+    tensors = as_tensors(cameras, who)
+    offset = torch.zeros_like(tensors.intrinsics)
+    offset[..., :2, 2] = pixels
+    return tensors._replace(intrinsics=tensors.intrinsics + offset)
+
+
+def views_of(who: str, cameras: Cameras, scenes: int) -> CameraTensors:
+    """Cameras with the leading shape (B, V), whatever form they came in."""
+    tensors = as_tensors(cameras, who)
+    leading = tuple(tensors.cam_from_world.shape[:-2])
+    if len(leading) == 2 and leading[0] == scenes:
+        return tensors
+    if len(leading) != 1 or scenes == 0 or leading[0] % scenes:
+        raise ShapeError(f"{who}: cameras must have leading shape (B, V) or (B*V,) with B = {scenes}; got {leading}")
+    K, E, height, width = (
+        item.unflatten(0, (scenes, -1)) for item in (tensors.intrinsics, tensors.cam_from_world, *image_sizes(tensors))
+    )
+    return CameraTensors(K, E, height, width)

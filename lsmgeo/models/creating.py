@@ -10,8 +10,8 @@ from torch import nn
 
 from lsmgeo._checks import check_choice, describe
 from lsmgeo.errors import DTypeError, OptionError
+from lsmgeo.models.blocks import Model
 from lsmgeo.models.depth_lsm import DepthLSM
-from lsmgeo.models.model import Model
 from lsmgeo.models.r2n2 import R2N2, R2N2Settings
 from lsmgeo.models.settings import DepthSettings, VoxelSettings, nearest
 from lsmgeo.models.voxel_lsm import VoxelLSM

@@ -15,11 +15,10 @@ from lsmgeo.cameras.tensors import Cameras, CameraTensors, image_sizes
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid, depth_planes
 from lsmgeo.layers import PlaneSweepProject
-from lsmgeo.models.blocks import Block, Convolution, InstanceNorm
-from lsmgeo.models.machine import Machine, moved_center, views_of
-from lsmgeo.models.model import evaluating
+from lsmgeo.models.blocks import Block, Convolution, InstanceNorm, evaluating, moved_center, views_of
 from lsmgeo.models.outputs import DepthOutput, DepthResult
 from lsmgeo.models.settings import DepthSettings, changed
+from lsmgeo.models.voxel_lsm import Machine
 from lsmgeo.rays import ProjectReduce
 
 __all__ = ["DepthLSM"]

@@ -17,8 +17,7 @@ from lsmgeo._checks import check_devices, check_float, check_mask
 from lsmgeo.cameras.tensors import Cameras, as_tensors, check_cameras
 from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.grids import VoxelGrid
-from lsmgeo.models.blocks import interleave
-from lsmgeo.models.model import VoxelModel
+from lsmgeo.models.blocks import VoxelModel, interleave
 from lsmgeo.models.outputs import VoxelOutput, chosen_steps
 from lsmgeo.models.settings import changed, check_settings
 

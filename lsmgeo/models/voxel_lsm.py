@@ -1,23 +1,214 @@
-"""V-LSM, the Voxel Learnt Stereo Machine: images and cameras to occupancy."""
+"""V-LSM, the Voxel Learnt Stereo Machine: images and cameras to occupancy.
+
+Image encoder, unprojection, recurrent fusion and grid network, which D-LSM begins with too.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
+from lsmgeo._checks import check_devices, check_float, check_mask
 from lsmgeo.cameras.tensors import Cameras
+from lsmgeo.errors import ShapeError
+from lsmgeo.fusion import ConvGRU3d, ConvLSTM3d
 from lsmgeo.grids import VoxelGrid
-from lsmgeo.models.blocks import Block, interleave
-from lsmgeo.models.machine import Machine
-from lsmgeo.models.model import VoxelModel
-from lsmgeo.models.outputs import VoxelOutput
-from lsmgeo.models.settings import VoxelSettings, changed
+from lsmgeo.layers import Unproject
+from lsmgeo.models.blocks import Block, Model, VoxelModel, interleave, moved_center
+from lsmgeo.models.outputs import VoxelOutput, chosen_steps
+from lsmgeo.models.settings import MachineSettings, VoxelSettings, changed
 
-__all__ = ["VoxelLSM"]
+__all__ = ["Encoded", "GridUNet", "ImageEncoder", "Machine", "Seen", "VoxelLSM"]
 
 PAPER = VoxelSettings()
+
+
+class Encoded(NamedTuple):
+    """Features (N, F, h, w), and the maps on the way down, finest first, at strides 2, 4, ..."""
+
+    features: Tensor
+    maps: tuple[Tensor, ...]
+
+
+class ImageEncoder(nn.Module):
+    """Images to features by convolutions down, transposed convolutions up, and skips between maps of one size.
+
+    Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017, section 3, with the widths of their release.
+    Of 224 pixels at stride 2: 32 @ 112, 64 @ 56, 128 @ 28, 256 @ 14; up 128 @ 28, 64 @ 56, 32 @ 112; features 32 @ 112.
+
+    Args:
+        settings: of the machine.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.models.settings import VoxelSettings
+        >>> encoder = ImageEncoder(VoxelSettings(encoder_channels=(4, 8), feature_channels=6))
+        >>> features, maps = encoder(torch.rand(1, 3, 16, 24))
+        >>> tuple(features.shape), [tuple(item.shape) for item in maps]
+        ((1, 6, 8, 12), [(1, 4, 8, 12), (1, 8, 4, 6)])
+    """
+
+    def __init__(self, settings: MachineSettings) -> None:
+        super().__init__()
+        is_release = settings.variant == "release"
+        # Even kernels of stride 2 keep a map where its image is; the paper does not tell its kernels.
+        first, kernel, norm = (5, 3, "shift") if is_release else (6, 4, "scale")
+        channels = settings.encoder_channels
+        self.down = nn.ModuleList([Block(2, 3, channels[0], first, norm=norm, activate=False, stride=2)])
+        self.down.extend(Block(2, before, after, kernel, norm=norm, stride=2) for before, after in pairwise(channels))
+        self.up = nn.ModuleList()
+        before = channels[-1]
+        for level in range(len(channels) - 2, settings.feature_stride.bit_length() - 3, -1):
+            self.up.append(Block(2, before, channels[level], kernel, norm=norm, stride=2, transposed=True))
+            before = 2 * channels[level]
+        self.out = Block(2, before, settings.feature_channels, 5, norm="none", transposed=is_release)
+
+    def forward(self, images: Tensor) -> Encoded:
+        """Encode images (N, 3, H, W), H and W divisible by 2 to the number of levels."""
+        x = images
+        maps: list[Tensor] = []
+        for block in self.down:
+            x = block(x)
+            maps.append(x)
+        for level, block in zip(range(len(maps) - 2, -1, -1), self.up, strict=False):
+            x = torch.cat((block(x), maps[level]), 1)
+        return Encoded(self.out(x), tuple(maps))
+
+
+class GridUNet(nn.Module):
+    """The fused grid to a grid of features, by convolutions down, transposed convolutions up, and skips.
+
+    Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017, section 3, with the widths of their release.
+    On 32^3: 32 @ 16, 64 @ 8, 128 @ 4; up 64 @ 8, 32 @ 16, 32 @ 32. The output, of `out_channels`, is not yet activated.
+
+    Args:
+        settings: of the machine.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.models.settings import VoxelSettings
+        >>> network = GridUNet(VoxelSettings(grid_size=8, hidden_channels=3, grid_channels=(4, 5), output_channels=6))
+        >>> tuple(network(torch.rand(1, 3, 8, 8, 8)).shape)
+        (1, 6, 8, 8, 8)
+    """
+
+    def __init__(self, settings: MachineSettings) -> None:
+        super().__init__()
+        self.skip = settings.grid_skip
+        self.out_channels = settings.output_channels + (settings.hidden_channels if settings.grid_skip else 0)
+        norm = "shift" if settings.variant == "release" else "scale"
+        channels = (settings.hidden_channels, *settings.grid_channels)
+        self.down = nn.ModuleList(
+            Block(3, before, after, 4, norm=norm, activate=level > 0, stride=2)
+            for level, (before, after) in enumerate(pairwise(channels))
+        )
+        # Widths on the way up, the last at the grid's own size, where there is no skip.
+        after = (*reversed(settings.grid_channels[:-1]), settings.output_channels)
+        before = (channels[-1], *(2 * width for width in after[:-1]))
+        pairs = list(zip(before, after, strict=True))
+        self.up = nn.ModuleList(
+            Block(3, first, second, 4, norm=norm, stride=2, transposed=True) for first, second in pairs
+        )
+
+    def forward(self, grid: Tensor) -> Tensor:
+        """Map the state of the fusion (N, C, D, H, W) to features."""
+        x = grid
+        maps: list[Tensor] = []
+        for block in self.down:
+            x = block(x)
+            maps.append(x)
+        maps.pop()
+        for block in self.up:
+            x = block(x)
+            if maps:
+                x = torch.cat((x, maps.pop()), 1)
+        return torch.cat((x, grid), 1) if self.skip else x
+
+
+class Seen(NamedTuple):
+    """Grids (B, S, C, D, H, W) after S of the views, and the image encoder's early maps (B, V, C, h, w)."""
+
+    grids: Tensor
+    maps: tuple[Tensor, ...]
+
+
+class Machine(Model):
+    """Image encoder, unprojection, recurrent fusion, grid network: a `Seen` of images and cameras."""
+
+    def __init__(self, settings: MachineSettings) -> None:
+        super().__init__()
+        is_release = settings.variant == "release"
+        self.image_size = settings.image_size
+        # The release takes pixel j of a map at j times its stride: the camera's image lies aside by so many pixels.
+        self.lift_offset = (settings.feature_stride - 1) / 2 if settings.pixel_rules == "release" else 0.0
+        self.resolution = settings.grid_size
+        self.grid = VoxelGrid(settings.grid_size)
+        self.image_encoder = ImageEncoder(settings)
+        # "zeros": what lies outside an image is told apart from what looks like its border; the release smears that.
+        padding_mode = "border" if is_release else "zeros"
+        self.unproject = Unproject(
+            self.grid, padding_mode=padding_mode, augment="depth" if is_release else ("depth", "direction")
+        )
+        self.lift = settings.lift
+        self.unproject_finely: Unproject | None = None
+        if settings.lift > 1:
+            self.unproject_finely = Unproject(VoxelGrid(settings.grid_size * settings.lift), padding_mode=padding_mode)
+        recurrence = ConvGRU3d if settings.fusion == "gru" else ConvLSTM3d
+        self.fusion = recurrence(
+            settings.feature_channels * settings.lift**3 + (1 if is_release else 4),
+            settings.hidden_channels,
+            kernel_size=settings.input_kernel,
+            state_kernel_size=settings.state_kernel,
+            eps=1e-12 if is_release else 1e-5,
+        )
+        self.grid_network = GridUNet(settings)
+
+    def see(
+        self,
+        images: Tensor,
+        cameras: Cameras,
+        view_mask: Tensor | None,
+        steps: str | Sequence[int] | None,
+    ) -> Seen:
+        """The common part of `forward`, whose arguments these are."""
+        after = chosen_steps(self.name, steps, self._check(images, view_mask))
+        if view_mask is not None:
+            images = torch.where(view_mask[:, :, None, None, None], images, 0.0)
+        views = tuple(images.shape[:2])
+        features, maps = self.image_encoder(images.flatten(0, 1))
+        volume = self._unproject(features.unflatten(0, views), cameras, view_mask)
+        states = self.fusion.states(volume, None, view_mask)[:, after]
+        grids = self.grid_network(states.flatten(0, 1)).unflatten(0, states.shape[:2])
+        return Seen(grids, tuple(item.unflatten(0, views) for item in maps))
+
+    def _unproject(self, features: Tensor, cameras: Cameras, view_mask: Tensor | None) -> Tensor:
+        """The volume (B, V, C, D, H, W) of every view: its samples, sub-voxel by sub-voxel, depth and direction."""
+        if self.lift_offset:
+            cameras = moved_center(self.name, cameras, self.lift_offset)
+        if self.unproject_finely is None:
+            return self.unproject(features, cameras, view_mask).volume
+        samples = self.unproject_finely(features, cameras, view_mask).volume
+        cells = samples.unflatten(5, (-1, self.lift)).unflatten(4, (-1, self.lift)).unflatten(3, (-1, self.lift))
+        folded = cells.permute(0, 1, 2, 4, 6, 8, 3, 5, 7).flatten(2, 5)  # (B, V, C * lift^3, D, H, W)
+        geometry = self.unproject(features[:, :, :0], cameras, view_mask).volume
+        return torch.cat((folded, geometry), 2)
+
+    def _check(self, images: Tensor, view_mask: Tensor | None) -> int:
+        """Check images and mask; the number of views."""
+        stride = 1 << len(self.image_encoder.down)
+        expected = f"(B, V, 3, H, W), V at least 1, H and W multiples of {stride}, {2 * stride} at least"
+        check_float(self.name, "images", images, expected, 5)
+        _, V, channels, height, width = images.shape
+        if V < 1 or channels != 3 or height % stride or width % stride or min(height, width) < 2 * stride:
+            raise ShapeError(f"{self.name}: images must be {expected}; got {tuple(images.shape)}")
+        if view_mask is not None:
+            check_mask(self.name, "view_mask", view_mask, tuple(images.shape[:2]), "(B, V)")
+            check_devices(self.name, images=images, view_mask=view_mask)
+        return V
 
 
 class VoxelLSM(Machine, VoxelModel):

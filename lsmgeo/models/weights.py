@@ -25,8 +25,8 @@ from torch.overrides import TorchFunctionMode
 from lsmgeo._checks import check_flag
 from lsmgeo.data.files import read_bytes, write_atomic
 from lsmgeo.errors import CheckpointError, DataError, LsmGeoError, OptionError
+from lsmgeo.models.blocks import Model
 from lsmgeo.models.creating import from_settings, settings_of
-from lsmgeo.models.model import Model
 
 __all__ = [
     "CHECKPOINTS",

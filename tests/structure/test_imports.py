@@ -49,10 +49,7 @@ MAY_ALSO_IMPORT = {
     "diagnosis": {"data", "drawing"},
     "models": {"data", "scenes", "metrics", "drawing", "classical"},
 }
-NETWORKS = {
-    "blocks", "creating", "depth_lsm", "grid_unet", "image_encoder", "losses", "machine", "model", "outputs", "r2n2",
-    "settings", "voxel_lsm",
-}  # fmt: skip
+NETWORKS = {"blocks", "creating", "depth_lsm", "losses", "outputs", "r2n2", "settings", "voxel_lsm"}
 HEAVY = {"cv2", "trimesh", "skimage", "matplotlib", "jsonargparse", "triton", "scipy", "tqdm", "PIL"}
 
 

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.data import Batch, Sample
 from lsmgeo.metrics import DepthError, VoxelIoU
+from lsmgeo.models.blocks import evaluating
 from lsmgeo.models.losses import sum_loss
-from lsmgeo.models.model import evaluating
 from lsmgeo.models.training.launch import StopRequest, any_true, gather
 from lsmgeo.models.training.pictures import Example
 

@@ -19,8 +19,8 @@ import torch
 from torch import distributed
 
 from lsmgeo.errors import DataError, OptionError, TrainingError
+from lsmgeo.models.blocks import Model
 from lsmgeo.models.creating import MODELS, create, settings_of
-from lsmgeo.models.model import Model
 from lsmgeo.models.training.checkpoints import Checkpoint
 from lsmgeo.models.training.config import ModelConfig, RunConfig, TrainingConfig
 from lsmgeo.models.weights import load

@@ -18,7 +18,7 @@ CORE_COVERAGE := 95
 DEVICE_CODE := lsmgeo/kernels/gpu_kernels.py,lsmgeo/kernels/gpu_gradients.py
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-bare test-long lint docs bench wheel clean
+.PHONY: help setup demo test test-floors test-long lint docs bench wheel clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -69,10 +69,23 @@ test: $(VENV)/.dev ## whole suite, doctests, and the core's coverage
 	@echo 'lines of the core:'
 	@$(BIN)/coverage report --include='$(CORE)' --omit='$(DEVICE_CODE)' --fail-under=$(CORE_COVERAGE)
 
-# The operators on PyTorch alone: what runs where nothing was compiled and Triton is absent.
-test-bare: $(VENV)/.dev ## the operators' tests without the C++ kernels and without Triton
-	LSMGEO_NATIVE=0 LSMGEO_TEST_WITHOUT_TRITON=1 HYPOTHESIS_PROFILE=dev $(PYTEST) -n $(JOBS) --dist worksteal \
-		-m 'not long' lsmgeo tests/kernels tests/property tests/structure
+# An environment of the lowest versions that setup.cfg admits, of PyTorch, kornia and NumPy alone.
+FLOORS := $(VENV)-floors
+$(FLOORS)/.made: setup.cfg | $(BIN)/python
+	@echo 'installing the oldest PyTorch, kornia and NumPy into $(FLOORS) (once; PyTorch is large)'
+	$(BIN)/python -m venv --clear $(FLOORS)
+	$(call install,$(FLOORS)/bin,$$(sed -nE 's/^ +((torch|kornia|numpy))>=/\1==/p; s/^ +((pytest|hypothesis).*)/\1/p' setup.cfg))
+	@touch $@
+
+# The operators as in somebody's own environment: lsmgeo without its other dependencies, without the C++ kernels (no
+# compiler is found) and without Triton. The checkout is out of sight, so that what is installed is what is tested.
+CORE_MODULES := $(addprefix lsmgeo.,cameras kernels grids functional layers fusion rays)
+test-floors: $(FLOORS)/.made ## the operators' tests at the lowest versions, installed beside PyTorch, kornia and NumPy alone
+	@rm -rf build/lib build/floors && mkdir -p build/floors && ln -s ../../tests ../../setup.cfg build/floors
+	CC=false CXX=false $(FLOORS)/bin/python -m pip install --quiet --no-deps --force-reinstall .
+	cd build/floors && LSMGEO_NATIVE=0 LSMGEO_TEST_WITHOUT_TRITON=1 HYPOTHESIS_PROFILE=dev OMP_NUM_THREADS=1 \
+		$(abspath $(FLOORS))/bin/python -m pytest -n $(JOBS) --dist worksteal -m 'not long' --pyargs \
+		$(CORE_MODULES) tests/kernels tests/property tests/interop/test_compile.py::test_gradients_of_a_graph
 
 test-long: $(VENV)/.dev ## the long forms: random examples in number, slow checks
 	HYPOTHESIS_PROFILE=long $(PYTEST) -n $(JOBS) --dist worksteal --timeout 3600 --durations=20

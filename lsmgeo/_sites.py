@@ -105,7 +105,7 @@ def image_sites(
     T, x, y, z, projective = lattice
     T = T if T.dim() == 2 else T[:, None]  # (B, 1, 4, 4): shared by the views
     direction = direction_matrix(matrices, T, options.direction) if options.direction else None
-    return Sites(multiply(matrices.projection, T), direction, x, y, z, projective, view_mask)
+    return Sites(multiply(matrices.projection(), T), direction, x, y, z, projective, view_mask)
 
 
 def sweep_sites(
@@ -154,7 +154,7 @@ def sweep_sites(
     size = common_size(who, tensors) if size is None else check_size(who, "size", size, 2, "(h, w)")  # type: ignore[assignment]
     assert size is not None
     matrices = camera_matrices(tensors, size, view_mask)
-    frustum = matrices.world_from_frustum
+    frustum = matrices.world_from_frustum()
     inverse = affine_inverse(lattice.world_from_lattice)[..., :3, :]
     matrix = multiply(inverse if inverse.dim() == 2 else inverse[:, None], frustum)
     direction = direction_matrix(matrices, frustum, options.direction) if options.direction else None

@@ -242,7 +242,7 @@ def unproject_points(
     if options.direction:
         world = torch.eye(4, dtype=torch.float64, device=features.device)
         direction = direction_matrix(matrices, world, options.direction)
-    arguments = (matrices.projection, direction, points, view_mask)
+    arguments = (matrices.projection(), direction, points, view_mask)
     return Unprojected(*kernels.run("unproject_points", features, *arguments, options=options, backend=backend))
 
 

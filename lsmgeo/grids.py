@@ -285,13 +285,13 @@ class FrustumGrid:
     @property
     def world_from_lattice(self) -> Tensor:
         """Homogeneous world from (u, v, 1/depth, 1), (4, 4) or (B, 4, 4), float64."""
-        return camera_matrices(as_tensors(self.camera), self.size).world_from_frustum
+        return camera_matrices(as_tensors(self.camera), self.size).world_from_frustum()
 
     @property
     def lattice_from_world(self) -> Tensor:
         """(u, v, 1/depth, 1) up to a factor from homogeneous world, (4, 4) or (B, 4, 4), float64."""
         matrices = camera_matrices(as_tensors(self.camera), self.size)
-        P = matrices.projection
+        P = matrices.projection()
         return torch.cat((P[..., :2, :], basis_row(P, 4, 3), P[..., 2:, :]), -2)
 
     def lattice(self, device: torch.device | None = None) -> Lattice:

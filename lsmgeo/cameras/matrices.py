@@ -21,20 +21,17 @@ class CameraMatrices(NamedTuple):
     translation: Tensor
     center: Tensor
 
-    @property
     def projection(self) -> Tensor:
         """P = K [R|t], (..., 3, 4): pixel from world."""
         return multiply(self.intrinsics, torch.cat((self.rotation, self.translation[..., None]), -1))
 
-    @property
     def world_from_pixel(self) -> Tensor:
         """R^T K^-1, (..., 3, 3): applied to (u, v, 1), the step along a pixel's ray that advances camera z by 1."""
         return multiply(self.rotation.transpose(-1, -2), inverse_3x3(self.intrinsics))
 
-    @property
     def world_from_frustum(self) -> Tensor:
         """T, (..., 4, 4), with ``X ~ T (u, v, 1/depth, 1)``; column three is the camera centre."""
-        rays = self.world_from_pixel
+        rays = self.world_from_pixel()
         rows = torch.cat((rays[..., :2], self.center[..., None], rays[..., 2:]), -1)
         return torch.cat((rows, basis_row(rows, 4, 2)), -2)
 

@@ -345,7 +345,7 @@ def rays(cameras: Cameras, size: tuple[int, int] | None = None) -> tuple[Tensor,
         indexing="ij",
     )
     pixels = torch.stack((u, v, torch.ones_like(u)), -1)  # (h, w, 3)
-    directions = transform(matrices.world_from_pixel[..., None, None, :, :], pixels)
+    directions = transform(matrices.world_from_pixel()[..., None, None, :, :], pixels)
     directions = directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True)
     return (matrices.center + 0.0).to(dtype), directions.to(dtype)
 

@@ -103,8 +103,8 @@ def render_mesh(
     lights = Lights(*(value[0] for value in checked_lights(who, lights, 1, torch.device("cpu"), torch.float32)))
     matrices = camera_matrices(tensors, size)
     centers = matrices.center.numpy(force=True)
-    from_pixel = matrices.world_from_pixel.numpy(force=True)
-    projections = matrices.projection.numpy(force=True)
+    from_pixel = matrices.world_from_pixel().numpy(force=True)
+    projections = matrices.projection().numpy(force=True)
 
     images = behind(who, background, (len(centers), 3, *size), torch.device("cpu"), torch.float32)
     depth, mask = torch.zeros(len(centers), *size), torch.zeros(len(centers), *size, dtype=torch.bool)

@@ -28,13 +28,16 @@ __all__ = ["KERNELS", "operators", "why_not"]
 # Modules of one protocol: why_not, images, images_backward, pixels, pixels_backward, volume, volume_backward.
 KERNELS: dict[str, Any] = {"cpu": cpu, "triton": gpu}
 
+# PyTorch 2.6 cannot tell export from compile: both take the reference there.
+_is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)
+
 LARGEST_TILE = {"cpu": 16 << 20, "triton": 256 << 20}  # bytes
 LEAST_TILES = 32
 
 
 def why_not(name: str, operator: str, source: Tensor, options: Options) -> str | None:
     """Why the kernels of this name cannot run a call, or None."""
-    if torch.compiler.is_exporting():
+    if _is_exporting():
         return "torch.export takes the reference, whose operations every runtime knows"
     if not torch.compiler.is_compiling() and _is_transformed():
         return "torch.func, forward-mode derivatives and torch.jit take the reference"

@@ -42,7 +42,9 @@ class Sites(NamedTuple):
 
     def slab(self, start: int, stop: int) -> Sites:
         """The sites of planes start to stop."""
-        return self._replace(z=self.z[..., start:stop])
+        z = self.z[..., start:stop]
+        # Not by _replace, which PyTorch compiles only in versions after 2.7.
+        return Sites(self.matrix, self.direction, self.x, self.y, z, self.projective, self.view_mask)
 
 
 class Options(NamedTuple):

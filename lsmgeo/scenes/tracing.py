@@ -108,7 +108,7 @@ class CameraRays:
         self.index = {pair: place for place, pair in enumerate(pairs)}
         device = cameras.intrinsics.device
         rows, views = torch.tensor(pairs, device=device).unbind(1)
-        self.from_pixel = cameras.world_from_pixel
+        self.from_pixel = cameras.world_from_pixel()
         solids = plan.tables
         linear, offset = solids.linear[rows], cameras.center[views] - solids.center[rows]
         depth = (-(offset * cameras.rotation[views, 2]).sum(-1)).clamp_min(near)

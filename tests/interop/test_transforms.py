@@ -20,6 +20,7 @@ from lsmgeo import (
     functional,
 )
 from lsmgeo import rays as along_rays
+from tests.abilities import needs_second_derivatives
 from tests.interop.models import GRID, UNPROJECTIONS, ThereAndBack, arguments, assert_same, views
 
 OPTIONS = {"augment": ("depth", "direction"), "padding_mode": "border"}
@@ -61,6 +62,7 @@ def volume_of(features, K, E):
 
 
 # PyTorch's own forward-mode formulas are scripts, which warn of their age when first used.
+@needs_second_derivatives
 @pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_forward_mode(dtype):
@@ -81,6 +83,7 @@ def test_forward_mode(dtype):
     torch.testing.assert_close(actual, expected, rtol=1e-3 if dtype == torch.float32 else 1e-9, atol=0.0)
 
 
+@needs_second_derivatives
 @pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")
 def test_forward_mode_of_a_sweep():
     volume = torch.rand(2, 4, *GRID.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -126,6 +129,7 @@ def test_gradients_of_each_scene_at_once():
     torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-4)
 
 
+@needs_second_derivatives
 def test_double_backward():
     features, K, E = (tensor.double().requires_grad_() for tensor in arguments(1, 2)[:3])
 

@@ -13,6 +13,7 @@ from lsmgeo.cameras import CameraTensors, crop, from_opencv, orbit, select, to
 from lsmgeo.cameras import rays as camera_rays
 from lsmgeo.errors import CameraError, DeviceError, DTypeError, ShapeError
 from lsmgeo.kernels import Options
+from tests.abilities import needs_second_derivatives
 
 VIEWS = orbit(torch.tensor([[0.0, 40.0]]), 10.0, 2.0, focal_length=50.0, height=24, width=32)
 FEATURES = torch.rand(1, 2, 3, 12, 16, generator=torch.Generator().manual_seed(0))
@@ -62,6 +63,7 @@ def test_geometry_that_nothing_depends_on_gets_no_gradient(call):
 
 
 # PyTorch's own: its forward-mode rules are made by the deprecated script compiler.
+@needs_second_derivatives
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script:FutureWarning")
 def test_forward_mode_through_a_reduction():
     with forward_ad.dual_level():

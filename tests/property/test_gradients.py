@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lsmgeo import CameraTensors, FrustumGrid, VoxelGrid, functional
 from tests import oracle, tolerances
+from tests.abilities import needs_second_derivatives
 from tests.property.test_unproject import plain_camera
 
 SHAPE = (2, 1, 3)
@@ -173,6 +174,7 @@ def test_reduced_gradients(reduce):
     assert torch.autograd.gradcheck(call, arguments, fast_mode=True)
 
 
+@needs_second_derivatives
 def test_second_derivatives():
     """Features and t, grid pose and t, volume and depths."""
     setup = smooth_setup("grid", 4)

@@ -211,8 +211,25 @@ for name in ("opencv", "opengl", "colmap", "pytorch3d"):
     parts = getattr(cameras, f"to_{name}")(views)
     getattr(cameras, f"from_{name}")(*parts, height=192, width=256)
 """
+OPERATORS = f"""
+sys.modules |= dict.fromkeys({HEAVY | {"safetensors", "jinja2"}!r})  # which cannot be imported then
+from lsmgeo import *
+from lsmgeo.fusion import ConvGRU3d, Variance
+views = cameras.orbit(torch.tensor([[0.0, 120.0]]), 20.0, 2.0, focal_length=20.0, height=16, width=20)
+views = cameras.crop(cameras.perturb(views, 5.0), 1, 2, 12, 14)
+features, grid = torch.rand(1, 2, 3, 6, 7, requires_grad=True), VoxelGrid(4)
+volume, visible = Unproject(grid, augment=("depth", "direction"))(features, views)
+points = functional.unproject_points(features, views, grid.centers().flatten(0, 2)[None], reduce="mean")
+fused = Variance()(volume, visible) + ConvGRU3d(7, 7)(volume)
+maps, seen = PlaneSweepProject(grid, depth_planes(1.0, 3.0, 5), size=(6, 7), flatten=False)(fused, views)
+depth = rays.expected_depth(maps[:, :, 0], depth_planes(1.0, 3.0, 5))
+reduced = rays.ProjectReduce(7, 2, grid, depth_planes(1.0, 3.0, 5), (6, 7))(fused, views)
+(depth.sum() + points.volume.sum() + reduced.maps.sum()).backward()
+assert features.grad.abs().sum() > 0
+"""
 CODE = {
     "lsmgeo": "from lsmgeo import *",
+    "operators": OPERATORS,
     "first calls": f"from lsmgeo import *\n{FIRST_CALLS}",
     **{package: f"import {package}" for package in PACKAGES},
 }
@@ -231,6 +248,11 @@ def test_the_import_is_light(brought):
     assert "lsmgeo.kernels.reference" in ours
     assert {name.split(".")[0] for name in ours} & HEAVY == set()
     assert {part(name) for name in ours if name.startswith("lsmgeo.")} <= set(MAY_IMPORT)
+
+
+def test_the_operators_run_on_pytorch_kornia_and_numpy_alone(brought):
+    """As after ``pip install --no-deps``; `make test-floors` runs their tests so."""
+    assert "lsmgeo.layers" in brought["operators"]
 
 
 def test_the_first_orbit_and_converters_import_nothing(brought):

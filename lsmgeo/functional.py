@@ -369,11 +369,12 @@ def plane_sweep_project(
         tensor([ 0.2500,  0.0000, -0.2500])
     """
     who = "PlaneSweepProject"
-    options = Options.checked(who, "trilinear", mode, padding_mode, augment, direction_frame, near=near)
+    options = Options.checked(
+        who, "trilinear", mode, padding_mode, augment, direction_frame, near=near, stacked=flatten
+    )
     kernels.check_backend(who, backend)
     check_flag(who, "flatten", flatten)
     sites = sweep_sites(who, volume, cameras, grid, depths, size, view_mask, options)
-    options = options._replace(stacked=flatten)
     maps, visible = kernels.run("plane_sweep_project", volume, sites, options=options, backend=backend)
     return Projected(maps.flatten(2, 3) if flatten else maps, visible)
 

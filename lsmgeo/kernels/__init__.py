@@ -81,7 +81,7 @@ def _differentiable(operator: str, args: tuple[Any, ...], options: Options) -> t
     sites, *others = args
     # The depth of an image's site comes from its matrix, that of a plane from the table of depths.
     matrix = sites.matrix if options.depth and operator == "unproject" else sites.matrix.detach()
-    return sites._replace(matrix=matrix, z=sites.z if appended else sites.z.detach()), *others
+    return sites.placed(matrix, sites.direction, sites.z if appended else sites.z.detach()), *others
 
 
 def explain(operator: str, source: Tensor, **options: Any) -> str:

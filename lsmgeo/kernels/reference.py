@@ -307,7 +307,7 @@ def unproject(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, T
         start: int, stop: int, source: Tensor, matrix: Tensor, direction: Tensor | None, z: Tensor
     ) -> tuple[Tensor, Tensor]:
         matrix = matrix * scale[..., None]  # homogeneous: a factor moves no pixel
-        part = Sites(matrix, direction, sites.x, sites.y, z[..., start:stop], sites.projective, sites.view_mask)
+        part = sites.placed(matrix, direction, z[..., start:stop])
         unit = (_per_view(part.z, matrix) * scale if part.projective else scale).to(dtype)[..., None, None]
         rows = _lattice_rows(matrix, part, dtype)
         values, visible, depth = _sample_through_cameras(source, rows, unit, part.view_mask, options)
@@ -422,7 +422,7 @@ def project_reduce(
     def piece(
         start: int, stop: int, volume: Tensor, matrix: Tensor, direction: Tensor | None, z: Tensor, weight: Tensor
     ) -> tuple[Tensor, Tensor]:
-        part = Sites(matrix, direction, sites.x, sites.y, z[..., start:stop], sites.projective, sites.view_mask)
+        part = sites.placed(matrix, direction, z[..., start:stop])
         maps, visible = _sweep(volume, part, options, dtype)
         stacked = maps.flatten(2, 3).flatten(3, 4)  # (B, V, C' p, h w)
         with torch.autocast(maps.device.type, enabled=False):

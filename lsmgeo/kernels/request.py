@@ -42,9 +42,11 @@ class Sites(NamedTuple):
 
     def slab(self, start: int, stop: int) -> Sites:
         """The sites of planes start to stop."""
-        z = self.z[..., start:stop]
-        # Not by _replace, which PyTorch compiles only in versions after 2.7.
-        return Sites(self.matrix, self.direction, self.x, self.y, z, self.projective, self.view_mask)
+        return self.placed(self.matrix, self.direction, self.z[..., start:stop])
+
+    def placed(self, matrix: Tensor, direction: Tensor | None, z: Tensor) -> Sites:
+        """The sites with other matrices and planes. PyTorch 2.7 does not compile `_replace`."""
+        return Sites(matrix, direction, self.x, self.y, z, self.projective, self.view_mask)
 
 
 class Options(NamedTuple):
@@ -69,6 +71,7 @@ class Options(NamedTuple):
         direction_frame: Any = "world",
         reduce: Any = None,
         near: Any = 1e-6,
+        stacked: bool = False,
     ) -> Options:
         """Options from a user's arguments (`smooth` or "nearest" is the mode); an `OptionError` names a wrong one."""
         mode = check_choice(who, "mode", smooth if mode is None else mode, (smooth, "nearest"))
@@ -81,4 +84,6 @@ class Options(NamedTuple):
         distance = check_number(who, "near", near, "a finite number, at least 0")
         if distance < 0:
             raise OptionError(f"{who}: near must be a finite number, at least 0; got {near}")
-        return cls(mode, padding_mode, "depth" in extra, frame if "direction" in extra else "", statistics, distance)
+        return cls(
+            mode, padding_mode, "depth" in extra, frame if "direction" in extra else "", statistics, distance, stacked
+        )

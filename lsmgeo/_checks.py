@@ -129,10 +129,10 @@ def check_broadcast(who: str, **shapes: Sequence[int]) -> tuple[int, ...]:
     return tuple(reversed(common))
 
 
-def check_number(who: str, name: str, value: Any, expected: str) -> float:
+def check_number(who: str, name: str, value: Any, expected: str, error: type[Exception] = OptionError) -> float:
     """Require a finite real number."""
     if not isinstance(value, Real) or isinstance(value, bool) or not abs(float(value)) < float("inf"):
-        raise OptionError(f"{who}: {name} must be {expected}; got {describe(value)}")
+        raise error(f"{who}: {name} must be {expected}; got {describe(value)}")
     return float(value)
 
 
@@ -158,7 +158,9 @@ def check_whole(who: str, name: str, value: Any, least: int, most: int = 2**63 -
     return int(value)
 
 
-def check_size(who: str, name: str, value: Any, length: int, expected: str) -> tuple[int, ...]:
+def check_size(
+    who: str, name: str, value: Any, length: int, expected: str, error: type[Exception] = ShapeError
+) -> tuple[int, ...]:
     """Require that many positive integers (an int alone stands for all of them where `length` is 3)."""
     if is_whole(value) and length == 3:
         value = (value,) * 3
@@ -168,12 +170,12 @@ def check_size(who: str, name: str, value: Any, length: int, expected: str) -> t
         or len(value) != length
         or not all(is_whole(item) or isinstance(item, torch.SymInt) for item in value)
     ):
-        raise ShapeError(f"{who}: {name} must be {expected}; got {describe(value)}")
+        raise error(f"{who}: {name} must be {expected}; got {describe(value)}")
     if any(item < 1 for item in value):
-        raise ShapeError(f"{who}: {name} must be {expected}, each at least 1; got {tuple(value)}")
+        raise error(f"{who}: {name} must be {expected}, each at least 1; got {tuple(value)}")
     sizes: tuple[int, ...] = tuple(item if isinstance(item, torch.SymInt) else int(item) for item in value)  # type: ignore[misc]
     if prod(sizes) > LARGEST_COUNT:
-        raise ShapeError(f"{who}: {name} must be {expected}, 2^31 - 1 cells at most; got {sizes}")
+        raise error(f"{who}: {name} must be {expected}, 2^31 - 1 cells at most; got {sizes}")
     return sizes
 
 

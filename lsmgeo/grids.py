@@ -30,7 +30,7 @@ from lsmgeo.cameras.matrices import camera_matrices
 from lsmgeo.cameras.tensors import Cameras, as_tensors, check_cameras
 from lsmgeo.cameras.transforms import common_size
 from lsmgeo.debugging import can_inspect
-from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
+from lsmgeo.errors import DTypeError, GridError, ShapeError
 
 __all__ = ["FrustumGrid", "Lattice", "VoxelGrid", "depth_planes"]
 
@@ -94,7 +94,9 @@ class VoxelGrid:
 
     def __post_init__(self) -> None:
         """Check and normalise the fields."""
-        object.__setattr__(self, "shape", _grid_shape("VoxelGrid", self.shape))
+        object.__setattr__(
+            self, "shape", check_size("VoxelGrid", "shape", self.shape, 3, "an int or (D, H, W)", GridError)
+        )
         for name in ("lower", "upper"):
             object.__setattr__(self, name, _bounds(name, getattr(self, name)))
         for axis, low, high in zip("xyz", self.lower, self.upper, strict=True):  # type: ignore[arg-type]
@@ -167,14 +169,6 @@ class VoxelGrid:
         return self.lattice().centers().to(dtype)
 
 
-def _grid_shape(who: str, value: object) -> tuple[int, int, int]:
-    try:
-        depth, height, width = check_size(who, "shape", value, 3, "an int or (D, H, W)")
-    except ShapeError as error:
-        raise GridError(str(error)) from None
-    return depth, height, width
-
-
 def _bounds(name: str, value: object) -> tuple[float, float, float]:
     if isinstance(value, Tensor):
         raise DTypeError(f"VoxelGrid: {name} must be numbers (gradients go to world_from_grid); got {describe(value)}")
@@ -183,10 +177,8 @@ def _bounds(name: str, value: object) -> tuple[float, float, float]:
     values = tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else (value,) * 3
     if len(values) != 3:
         raise GridError(f"VoxelGrid: {name} must be a number or (x, y, z); got {describe(value)}")
-    try:
-        x, y, z = (check_number("VoxelGrid", name, item, "a finite number or (x, y, z)") for item in values)
-    except OptionError as error:
-        raise GridError(str(error)) from None
+    expected = "a finite number or (x, y, z)"
+    x, y, z = (check_number("VoxelGrid", name, item, expected, GridError) for item in values)
     if not max(abs(x), abs(y), abs(z)) <= LARGEST_BOUND:
         raise GridError(f"VoxelGrid: {name} must be at most {LARGEST_BOUND:g}; got {(x, y, z)}")
     return x, y, z
@@ -267,7 +259,7 @@ class FrustumGrid:
             )
         check_devices(who, camera=camera.intrinsics, depths=self.depths)
         size = common_size(who, camera) if self.size is None else check_size(who, "size", self.size, 2, "(h, w)")
-        _grid_shape(who, (self.depths.shape[-1], *size))
+        check_size(who, "shape", (self.depths.shape[-1], *size), 3, "(P, h, w)", GridError)
         object.__setattr__(self, "camera", camera)
         object.__setattr__(self, "size", tuple(size))
 
@@ -349,10 +341,7 @@ def depth_planes(near: float | Tensor, far: float | Tensor, num: int, spacing: s
             if value.dim() > 1:
                 raise ShapeError(f"{who}: {name} must be a number or (B,); got {tuple(value.shape)}")
         else:
-            try:
-                value = like.new_tensor(check_number(who, name, value, "a finite number"))
-            except OptionError as error:
-                raise GridError(str(error)) from None
+            value = like.new_tensor(check_number(who, name, value, "a finite number", GridError))
         ends.append(value)
     check_devices(who, near=ends[0], far=ends[1])
     if ends[0].dtype != ends[1].dtype:

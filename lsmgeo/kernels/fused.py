@@ -150,19 +150,14 @@ def _backward(name: str, gradient: Tensor, given: dict[str, Any], needs: Sequenc
 
 
 def _backward_shapes(name: str, gradient: Tensor, given: dict[str, Any], needs: Sequence[bool]) -> list[Tensor]:
-    source = given["source"]
-    shapes: dict[str, Callable[[], Tensor]] = {
-        "source": lambda: _channels_last(source, source.shape, 2 if name in ("images", "pixels") else 1, source.dtype),
-        "matrix": lambda: given["matrix"].new_empty(given["matrix"].shape),
-        "direction": lambda: given["matrix"].new_empty(given["matrix"].shape),
-        "z": lambda: given["matrix"].new_empty((*given["matrix"].shape[:2], given["z"].shape[-1])),
-        "pixels": lambda: given["pixels"].new_empty(given["pixels"].shape),
-        "extra": lambda: given["extra"].new_empty(given["extra"].shape),
-        "weight": lambda: given["weight"].new_empty(given["weight"].shape),
-        "bias": lambda: given["bias"].new_empty(given["bias"].shape),
-    }
+    def made(part: str) -> Tensor:
+        like = given["matrix" if part in ("direction", "z") else part]
+        if part == "source":
+            return _channels_last(like, like.shape, 2 if name in ("images", "pixels") else 1, like.dtype)
+        return like.new_empty((*like.shape[:2], given["z"].shape[-1]) if part == "z" else like.shape)
+
     parts = zip(_DIFFERENTIABLE[name], needs, strict=True)
-    return [shapes[part]() if need and given[part] is not None else gradient.new_empty(0) for part, need in parts]
+    return [made(part) if need and given[part] is not None else gradient.new_empty(0) for part, need in parts]
 
 
 def _keep(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
@@ -354,39 +349,20 @@ def _project_reduce_backward(
 # The operators of a backend, as `lsmgeo.kernels` calls them
 
 
-def _unproject(kernels: str, source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
-    return torch.ops.lsmgeo.images(source, *sites, *options, kernels)
+def _on_sites(name: str, kernels: str, source: Tensor, sites: Sites, *arguments: Any) -> tuple[Tensor, Tensor]:
+    return getattr(torch.ops.lsmgeo, name)(source, *sites, *arguments[:-1], *arguments[-1], kernels)
 
 
-def _sweep(kernels: str, source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
-    return torch.ops.lsmgeo.volume(source, *sites, *options, kernels)
-
-
-def _reduced_sweep(
-    kernels: str, source: Tensor, sites: Sites, weight: Tensor, bias: Tensor | None, options: Options
-) -> tuple[Tensor, Tensor]:
-    return torch.ops.lsmgeo.project_reduce(source, *sites, weight, bias, *options, kernels)
-
-
-def _points(kernels: str, source: Tensor, *arguments: Any) -> tuple[Tensor, Tensor]:
-    options = arguments[-1]
-    pixels, front, extra = project_points(*arguments)
-    return torch.ops.lsmgeo.pixels(source, pixels, front, extra, *options, kernels)
-
-
-def _views(kernels: str, source: Tensor, *arguments: Any) -> tuple[Tensor, Tensor]:
-    options = arguments[-1]
-    pixels, front, extra = pixels_in_front(*arguments)
-    return torch.ops.lsmgeo.pixels(source, pixels, front, extra, *options, kernels)
+def _on_pixels(project: Callable[..., Any], kernels: str, source: Tensor, *arguments: Any) -> tuple[Tensor, Tensor]:
+    return torch.ops.lsmgeo.pixels(source, *project(*arguments), *arguments[-1], kernels)
 
 
 def operators(kernels: str) -> dict[str, Callable[..., Any]]:
     """The operators run by the kernels of this name."""
-    named = {
-        "unproject": _unproject,
-        "unproject_points": _points,
-        "sample_views": _views,
-        "plane_sweep_project": _sweep,
-        "project_reduce": _reduced_sweep,
+    return {
+        "unproject": partial(_on_sites, "images", kernels),
+        "unproject_points": partial(_on_pixels, project_points, kernels),
+        "sample_views": partial(_on_pixels, pixels_in_front, kernels),
+        "plane_sweep_project": partial(_on_sites, "volume", kernels),
+        "project_reduce": partial(_on_sites, "project_reduce", kernels),
     }
-    return {name: partial(operator, kernels) for name, operator in named.items()}

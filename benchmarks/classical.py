@@ -210,11 +210,11 @@ PUBLISHED = np.array([(-0.073568, 0.021728, -0.012445), (0.028855, 0.181892, 0.0
 
 def project_back(occupancy: torch.Tensor, grid: VoxelGrid, camera: CameraTensors, size: tuple[int, int]) -> Any:
     """The silhouette of voxels, (h, w) bool: the nearest voxels at depths a voxel apart, the largest along each ray."""
-    depth = (
-        grid.centers().flatten(0, -2) @ camera.cam_from_world[2, :3].to(grid.centers()) + camera.cam_from_world[2, 3]
-    )
+    T, E = grid.world_from_lattice, camera.cam_from_world.double()
+    ends = (torch.tensor([-0.5, count - 0.5], dtype=torch.float64) for count in reversed(grid.shape))
+    depth = (torch.cartesian_prod(*ends) @ T[:3, :3].T + T[:3, 3]) @ E[2, :3] + E[2, 3]  # of the box's corners
     step = voxel_side(grid)
-    planes = torch.arange(float(depth.min()) - step, float(depth.max()) + 2 * step, step)
+    planes = torch.arange(float(depth.min()), float(depth.max()) + step, step)
     where = stack([camera]), grid
     return torch.stack(
         [

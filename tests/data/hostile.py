@@ -1,6 +1,7 @@
 """Damaging shards and scenes, and saying what became of reading them."""
 
 import io
+import os
 import tarfile
 
 import numpy as np
@@ -11,6 +12,8 @@ from lsmgeo.data import ShardSet
 from lsmgeo.errors import DataError
 
 TAR, SIDECAR = "set-000000.tar", "set-000000.json"
+# How many mutations of a file are tried: more in `make test-long`.
+TRIALS = 2000 if os.environ.get("HYPOTHESIS_PROFILE") == "long" else 100
 
 
 def read_all(folder):
@@ -91,16 +94,16 @@ def scene_refused(folder, match=None, file=None):
     assert len(str(caught.value)) < 2000
 
 
-def judge_mutations(folder, file, trials, run):
+def judge_mutations(folder, file, run):
     """Whatever is changed in a file, it is read or refused, and no file of the folder changes."""
     rng = np.random.default_rng(0)
     original = file.read_bytes()
     before = sorted((str(path), path.stat().st_size) for path in folder.rglob("*"))
     verdicts = []
-    for _ in range(trials):
+    for _ in range(TRIALS):
         file.write_bytes(mutated(rng, original))
         verdicts.append(judged(run))
     file.write_bytes(original)
     assert set(verdicts) <= {"read", "refused"}
-    assert verdicts.count("refused") > trials // 20
+    assert verdicts.count("refused") > TRIALS // 20
     assert sorted((str(path), path.stat().st_size) for path in folder.rglob("*")) == before

@@ -16,7 +16,7 @@ from lsmgeo.data.images import read_cut_out, read_image
 from lsmgeo.data.lenses import Lens
 from lsmgeo.errors import CameraError, DataError
 from tests.data import posed_writers
-from tests.data.hostile import mutated
+from tests.data.hostile import TRIALS, mutated
 from tests.data.writers import make_scene, write_colmap, write_middlebury
 
 
@@ -67,7 +67,7 @@ def test_damaged_depth_with_comments_is_refused(tmp_path):
     Image.fromarray(steps).save(tmp_path / "a.png", pnginfo=comments)
     content = (tmp_path / "a.png").read_bytes()
     rng = np.random.default_rng(0)
-    for _ in range(300):
+    for _ in range(TRIALS):
         (tmp_path / "b.png").write_bytes(mutated(rng, content))
         with contextlib.suppress(DataError):
             np.testing.assert_array_equal(DepthPng(tmp_path / "b.png", 1.0).read((5, 7)), steps)

@@ -211,4 +211,4 @@ def test_damaged_bytes_give_a_data_error_or_a_scene(tmp_path, form):
         if form == "jpeg":
             Image.fromarray(SCENE.images[1]).save(files[0], format="JPEG")
     for file in files:
-        judge_mutations(tmp_path, file, 100, lambda: read_scene(folder))
+        judge_mutations(tmp_path, file, lambda: read_scene(folder))

@@ -10,7 +10,7 @@ from lsmgeo import data
 from lsmgeo.data import calibration
 from lsmgeo.data.calibration import read_storages
 from lsmgeo.errors import DataError
-from tests.data.hostile import judged, mutated
+from tests.data.hostile import TRIALS, judged, mutated
 from tests.data.test_calibration import YAML, write_rig, write_storage
 
 pytestmark = pytest.mark.timeout(120)
@@ -135,7 +135,6 @@ def test_the_answer_of_a_process_is_checked(tmp_path, monkeypatch, array):
 
 @pytest.mark.parametrize("ending", ["yml", "xml", "json"])
 def test_damaged_calibrations_give_a_data_error_or_a_calibration(tmp_path, monkeypatch, ending):
-    trials = 300
     rng = np.random.default_rng(0)
     source = tmp_path / f"source.{ending}"
     write_storage(source, camera_matrix=np.eye(3), D=np.full(5, 0.25), R=np.eye(3), T=np.ones(3), image_width=64,
@@ -144,7 +143,7 @@ def test_damaged_calibrations_give_a_data_error_or_a_calibration(tmp_path, monke
     original = source.read_bytes()
     folder = tmp_path / "mutations"
     folder.mkdir()
-    paths = [folder / f"{index}.{ending}" for index in range(trials)]
+    paths = [folder / f"{index}.{ending}" for index in range(TRIALS)]
     for path in paths:
         path.write_bytes(mutated(rng, original))
     before = sorted(tmp_path.rglob("*"))
@@ -153,5 +152,5 @@ def test_damaged_calibrations_give_a_data_error_or_a_calibration(tmp_path, monke
         monkeypatch.setattr(calibration, "read_storages", lambda _, entries=entries: [entries])
         verdicts.append(judged(lambda path=path: data.read_calibration(path)))
     assert set(verdicts) == {"read", "refused"}
-    assert verdicts.count("refused") > trials // 20
+    assert verdicts.count("refused") > TRIALS // 20
     assert sorted(tmp_path.rglob("*")) == before

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from lsmgeo.data.assembling import MAX_SIDE, check_intrinsics, check_rotation
 from lsmgeo.data.files import child, refuse_unreadable
 from lsmgeo.data.images import SUFFIXES
 from lsmgeo.data.isolated import isolated
 from lsmgeo.data.lenses import Lens
+from lsmgeo.data.posed import MAX_SIDE, check_intrinsics, check_rotation
 from lsmgeo.data.storage import is_storage, parse_storage
 from lsmgeo.errors import DataError
 

@@ -8,19 +8,11 @@ from typing import Any
 import numpy as np
 
 from lsmgeo._checks import describe
-from lsmgeo.data.assembling import (
-    assemble,
-    check_intrinsics,
-    check_last_row,
-    check_picture,
-    check_rotation,
-    make_cameras,
-)
 from lsmgeo.data.depth_files import DepthPng
 from lsmgeo.data.files import child, refuse_unreadable
 from lsmgeo.data.images import has_alpha, image_size
 from lsmgeo.data.json_files import peek_json, read_json, take_array, take_number, take_text
-from lsmgeo.data.posed import PosedImages
+from lsmgeo.data.posed import PosedImages, assemble, check_camera, check_last_row, check_picture, make_cameras
 from lsmgeo.errors import DataError
 
 __all__ = ["FORMAT", "NAME", "VERSION", "is_cameras_json", "read_cameras_json"]
@@ -111,9 +103,8 @@ def read_cameras_json(path: str | Path) -> PosedImages:
         sizes.append(image_size(paths[-1]))
         check_picture(_size(entry, file, where), sizes[-1], paths[-1], file, where)
         intrinsics[view] = take_array(entry, "K", (3, 3), file, where)
-        check_intrinsics(intrinsics[view], file, where)
         poses[view] = _pose(entry, file, where)
-        check_rotation(poses[view, :, :3], file, where)
+        check_camera(intrinsics[view], poses[view, :, :3], file, where)
         depths.append(_depth(entry, file, where))
     cameras = make_cameras(intrinsics, poses[:, :, :3], poses[:, :, 3], sizes, file, pixel_center=center)
     return assemble(names, paths, cameras, "cameras", file=file, depths=depths, cut_out=any(map(has_alpha, paths)))

@@ -14,10 +14,9 @@ import numpy as np
 import torch
 
 from lsmgeo.cameras import from_colmap
-from lsmgeo.data.assembling import as_data_error, assemble
 from lsmgeo.data.files import MAX_TEXT_BYTES, child, parse_floats, parse_ints, read_bytes, read_text, refuse_unreadable
 from lsmgeo.data.lenses import Lens
-from lsmgeo.data.posed import Observations, PosedImages, SparsePoints
+from lsmgeo.data.posed import Observations, PosedImages, SparsePoints, as_data_error, assemble
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:

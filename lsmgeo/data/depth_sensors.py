@@ -8,17 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lsmgeo._checks import describe
-from lsmgeo.data.assembling import (
-    MAX_PARAMETER,
-    assemble,
-    check_intrinsics,
-    check_last_row,
-    check_rotation,
-    make_cameras,
-)
 from lsmgeo.data.depth_files import DepthPng
 from lsmgeo.data.files import child, parse_floats, read_text, refuse_unreadable
 from lsmgeo.data.images import image_size
+from lsmgeo.data.posed import MAX_PARAMETER, assemble, check_intrinsics, check_last_row, check_rotation, make_cameras
 from lsmgeo.errors import DataError, OptionError
 
 if TYPE_CHECKING:

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lsmgeo.data.assembling import MAX_PARAMETER, MAX_SIDE, assemble, check_rotation, make_cameras
 from lsmgeo.data.files import child, refuse_unreadable
 from lsmgeo.data.images import SUFFIXES, has_alpha, image_size
-from lsmgeo.data.posed import PosedImages
+from lsmgeo.data.posed import MAX_PARAMETER, MAX_SIDE, PosedImages, assemble, check_rotation, make_cameras
 from lsmgeo.errors import DataError
 
 __all__ = ["is_llff", "read_llff"]

@@ -12,14 +12,13 @@ import numpy as np
 import torch
 
 from lsmgeo._checks import check_choice
-from lsmgeo.data.assembling import assemble, check_intrinsics, check_last_row, check_rotation, make_cameras
 from lsmgeo.data.depth_files import DepthPng
 from lsmgeo.data.files import child, refuse_unreadable
 from lsmgeo.data.images import image_size
 from lsmgeo.data.isolated import isolated
 from lsmgeo.data.mat_files import parse_mat
 from lsmgeo.data.metadata import MAX_VIEWS
-from lsmgeo.data.posed import PosedImages, Voxels
+from lsmgeo.data.posed import PosedImages, Voxels, assemble, check_camera, check_last_row, make_cameras
 from lsmgeo.errors import DataError, OptionError
 from lsmgeo.grids import VoxelGrid
 
@@ -173,8 +172,7 @@ def _scene(found: LsmObject, cameras: list[Arrays]) -> PosedImages:
                 has = arrays[name].shape if name in arrays else "none"
                 raise DataError(file, f"must hold {name}, {shape[0]} x {shape[1]}; found {has}")
         intrinsics, extrinsic = arrays["K"], arrays["extrinsic"]
-        check_intrinsics(intrinsics, file, "K")
-        check_rotation(extrinsic[:3, :3], file, "extrinsic")
+        check_camera(intrinsics, extrinsic[:3, :3], file, "camera")
         check_last_row(extrinsic, file, "extrinsic")
         K.append(intrinsics)
         E.append(extrinsic)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lsmgeo.data.assembling import assemble, check_intrinsics, check_picture, check_rotation, make_cameras
 from lsmgeo.data.depth_files import DepthFile, read_pfm
 from lsmgeo.data.files import child, one_file, parse_floats, parse_ints, plain_files, read_text, refuse_unreadable
 from lsmgeo.data.images import image_size
+from lsmgeo.data.posed import assemble, check_camera, check_intrinsics, check_picture, make_cameras
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
@@ -72,8 +72,7 @@ def read_middlebury(path: str | Path) -> PosedImages:
         if len(tokens) != 22:
             raise DataError(file, f"{where}: expected a name and 21 numbers; got {len(tokens)} items")
         numbers[view] = parse_floats(tokens[1:], file, where)
-        check_intrinsics(numbers[view, :9].reshape(3, 3), file, where)
-        check_rotation(numbers[view, 9:18].reshape(3, 3), file, where)
+        check_camera(numbers[view, :9].reshape(3, 3), numbers[view, 9:18].reshape(3, 3), file, where)
         names.append(tokens[0])
         paths.append(child(file.parent, tokens[0], file))
         # The format does not state the size, so it comes from the picture's own header.

@@ -6,13 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from lsmgeo.data.assembling import assemble, make_cameras
 from lsmgeo.data.binvox import read_binvox
 from lsmgeo.data.files import child, parse_floats, read_text, refuse_unreadable
 from lsmgeo.data.images import image_size
 from lsmgeo.data.lsm_release import spell_synset
 from lsmgeo.data.metadata import MAX_VIEWS
-from lsmgeo.data.posed import PosedImages
+from lsmgeo.data.posed import PosedImages, assemble, make_cameras
 from lsmgeo.errors import DataError
 
 __all__ = ["METADATA", "is_r2n2", "read_r2n2"]

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from lsmgeo.cameras import to_colmap, to_opengl
-from lsmgeo.data.assembling import check_picture
 from lsmgeo.data.cameras_json import FORMAT, NAME, VERSION
 from lsmgeo.data.files import atomic_folder, child, read_bytes, write_atomic
 from lsmgeo.data.images import MAX_IMAGE_BYTES, SUFFIXES, encode_png, image_size, read_cut_out, read_image
+from lsmgeo.data.posed import check_picture
 from lsmgeo.errors import DataError, OptionError
 
 if TYPE_CHECKING:

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lsmgeo.data.assembling import assemble, check_intrinsics, check_picture, check_rotation, make_cameras
 from lsmgeo.data.files import child, parse_floats, plain_files, read_text, refuse_unreadable
 from lsmgeo.data.images import image_size
-from lsmgeo.data.posed import PosedImages
+from lsmgeo.data.posed import PosedImages, assemble, check_camera, check_picture, make_cameras
 from lsmgeo.errors import DataError
 
 __all__ = ["is_strecha", "read_strecha"]
@@ -67,8 +66,7 @@ def read_strecha(path: str | Path) -> PosedImages:
         if radial.any():
             raise DataError(file, "has radial distortion, whose model the format does not state; undistort first")
         intrinsics.append(matrix.reshape(3, 3))
-        check_intrinsics(intrinsics[-1], file, "camera")
-        check_rotation(rotation.reshape(3, 3), file, "camera")
+        check_camera(intrinsics[-1], rotation.reshape(3, 3), file, "camera")
         if np.abs(center).max() > 1e12:
             raise DataError(file, "the camera's centre lies beyond 1e12")
         names.append(file.name.removesuffix(SUFFIX))

@@ -12,21 +12,21 @@ import torch
 
 from lsmgeo._checks import describe
 from lsmgeo.cameras import from_opengl
-from lsmgeo.data.assembling import (
+from lsmgeo.data.depth_files import DepthFile, DepthPng
+from lsmgeo.data.files import child, one_file, plain_files, refuse_unreadable
+from lsmgeo.data.images import SUFFIXES, has_alpha, image_size
+from lsmgeo.data.json_files import peek_json, read_json, take_array, take_number, take_text
+from lsmgeo.data.lenses import Lens
+from lsmgeo.data.posed import (
     MAX_PARAMETER,
     MAX_SIDE,
+    PosedImages,
     as_data_error,
     assemble,
     check_last_row,
     check_picture,
     check_rotation,
 )
-from lsmgeo.data.depth_files import DepthFile, DepthPng
-from lsmgeo.data.files import child, one_file, plain_files, refuse_unreadable
-from lsmgeo.data.images import SUFFIXES, has_alpha, image_size
-from lsmgeo.data.json_files import peek_json, read_json, take_array, take_number, take_text
-from lsmgeo.data.lenses import Lens
-from lsmgeo.data.posed import PosedImages
 from lsmgeo.errors import DataError
 
 __all__ = ["is_transforms", "read_transforms"]

@@ -28,10 +28,10 @@ help: ## this list
 EDITABLE := --config-settings editable_mode=compat -e
 
 # uv installs in a tenth of pip's time. It is used where it is on PATH or can be fetched, and pip does the work otherwise.
-# $(1): bin folder of the environment, $(2): what to install
+# $(1): bin folder of the environment, $(2): what to install, $(3): options of uv
 define install
 	@if UV=$$(command -v uv) || { $(1)/python -m pip install --quiet uv 2>/dev/null && UV=$(1)/uv; }; then \
-		"$$UV" pip install --quiet --compile-bytecode --python $(1)/python $(2) && exit 0; \
+		"$$UV" pip install --quiet $(3) --python $(1)/python $(2) && exit 0; \
 		echo 'uv could not install; trying pip' >&2; \
 	fi; \
 	$(1)/python -m pip install --quiet $(2)
@@ -46,12 +46,12 @@ SOURCES := setup.cfg setup.py pyproject.toml $(wildcard lsmgeo/kernels/native/*)
 
 $(VENV)/.core: $(SOURCES) | $(BIN)/python
 	@echo 'installing lsmgeo into $(VENV) (once; PyTorch is large)'
-	$(call install,$(BIN),$(EDITABLE) .)
+	$(call install,$(BIN),$(EDITABLE) .,--compile-bytecode)
 	@touch $@
 
 $(VENV)/.dev: $(SOURCES) | $(BIN)/python
 	@echo 'installing lsmgeo and what its tests and docs need into $(VENV) (once; PyTorch is large)'
-	$(call install,$(BIN),$(EDITABLE) '.[dev]')
+	$(call install,$(BIN),$(EDITABLE) '.[dev]',--compile-bytecode)
 	@touch $(VENV)/.core $@
 
 setup: $(VENV)/.dev ## make the environment, with everything for tests and docs

@@ -266,8 +266,26 @@ def _unstacked(tile: Tensor, planes: int, channels: int, width: int) -> Tensor:
 
 def _linear(weight: Tensor, bias: Tensor | None) -> tuple[Tensor, Tensor]:
     """Weights (P C', O) and bias (O,) in float32."""
-    offset = weight.new_zeros(weight.shape[0], dtype=torch.float32) if bias is None else bias.float()
-    return weight.permute(2, 1, 0).reshape(-1, weight.shape[0]).float(), offset
+    outputs, channels, planes = weight.shape
+    offset = weight.new_zeros(outputs, dtype=torch.float32) if bias is None else bias.float()
+    return weight.permute(2, 1, 0).reshape(planes * channels, outputs).float(), offset
+
+
+def _can_saturate(
+    dtype: torch.dtype, source: Tensor, sites: Sites, kernel: Tensor, offset: Tensor, options: Options
+) -> bool:
+    """Whether a map may be beyond its dtype, which takes making it again to know."""
+    if dtype == torch.float32 or not offset.numel():
+        return False
+    if source.device.type != "cpu":  # to look at numbers would make it wait; bfloat16 holds what float32 does
+        return dtype == torch.float16
+    channels = [source.new_ones(1)]  # a direction's
+    if source.numel():
+        channels.append(source.abs().amax()[None])
+    if options.depth:
+        channels.append((1.0 / sites.z).amax()[None])
+    largest = float(torch.cat([channel.float() for channel in channels]).amax())
+    return not largest * float(kernel.abs().sum(0).amax()) + float(offset.abs().amax()) <= saturation_limit(dtype)
 
 
 def _project_reduce(kernels: Any, given: dict[str, Any], options: Options) -> tuple[Tensor, Tensor]:
@@ -306,7 +324,8 @@ def _project_reduce_backward(
     outputs, channels, planes = weight.shape
     (B, V), width, D = sites.matrix.shape[:2], sites.x.shape[0], sites.z.shape[-1]
     kernel, offset = _linear(weight, given["bias"])
-    options, saturates = options._replace(stacked=False), gradient.dtype != torch.float32
+    saturates = _can_saturate(gradient.dtype, source, sites, kernel, offset, options)
+    options = options._replace(stacked=False)
     places, needs_weight, needs_bias = needs[:4], needs[4], needs[5]
     to_source = _channels_last(source, source.shape, 1, torch.float32).zero_() if needs[0] else None
     parts = [sites.matrix.new_zeros(shape) for shape in ((B, V, 3, 4), (B, V, 3, 4), (B, V, D))]

@@ -348,6 +348,22 @@ def test_the_nearest_cell_depends_on_no_geometry_on_any_backend(name):
         assert offered[0] == [True, *(leaf.shape == cases.WEIGHT.shape for leaf in call.leaves[1:])]
 
 
+@pytest.mark.parametrize(
+    ("channels", "outputs", "augment"), [(0, 2, "depth"), (3, 0, ()), (0, 2, ("depth", "direction"))]
+)
+def test_reduced_sweeps_of_nothing_saturate_as_the_references(channels, outputs, augment):
+    width = channels + ("depth" in augment) + 3 * ("direction" in augment)
+    given = cases.VIEWS, cases.GRID, cases.DEPTHS
+    found = []
+    for backend in ("cpu", "reference"):
+        volume = torch.zeros(cases.B, channels, *cases.GRID.shape, dtype=torch.float16, requires_grad=True)
+        weight = torch.full((outputs, width * len(cases.DEPTHS)), 5e4, requires_grad=True)
+        maps, _ = rays.project_reduce(volume, *given, weight, None, cases.SIZE, augment=augment, backend=backend)
+        found.append([maps, *torch.autograd.grad(maps, (volume, weight), torch.ones_like(maps))])
+    for part, expected in zip(*found, strict=True):
+        torch.testing.assert_close(part, expected)
+
+
 def test_gradients_of_far_planes_are_finite():
     depths = torch.tensor([1.0, 2.0, 1e20, 1e25, 3e30])
     found = []

@@ -193,6 +193,12 @@ inline void unsummarise(const Call &call, const float *values, int64_t count, in
                         const float *const *gradients, float *out) {
     if (count == 0) return;
     const float share = 1.0f / float(count), limit = saturation_limit(call.gradient_type);
+    // No statistic is above the limit where no value is above its root.
+    int32_t is_large = 0;
+    if (limit < LARGEST) {
+        const float root = std::sqrt(limit);
+        for (int64_t at = 0; at < count * channels; at++) is_large |= int32_t(!(std::fabs(values[at]) <= root));
+    }
     over_channels(channels, [&](auto width, int64_t c) INLINED {
         constexpr int W = decltype(width)::value;
         const float *first = values + c;
@@ -201,8 +207,8 @@ inline void unsummarise(const Call &call, const float *values, int64_t count, in
             const int64_t kind = call.statistic[block];
             Masks<W> taker = {}, held = {};
             if (kind == MAX) taker = best_of<W>(first, count, channels, best);
-            if (kind == VARIANCE || (kind == MEAN && limit < LARGEST)) mean = mean_of<W>(first, count, channels);
-            if (limit < LARGEST) {
+            if (kind == VARIANCE || (kind == MEAN && is_large)) mean = mean_of<W>(first, count, channels);
+            if (is_large) {
                 const Floats<W> result =
                     kind == MAX ? best : kind == MEAN ? mean : variance_of<W>(first, count, channels, mean);
                 gradient = held_lanes<W>(result, limit) == result ? gradient : Floats<W>{};

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Iterable, Sequence
 from itertools import zip_longest
 from math import prod
@@ -36,6 +38,7 @@ __all__ = [
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 GEOMETRY = (torch.float32, torch.float64)
 LARGEST_COUNT = 2**31 - 1
+LARGEST = sys.float_info.max
 
 
 def describe(value: Any) -> str:
@@ -129,11 +132,23 @@ def check_broadcast(who: str, **shapes: Sequence[int]) -> tuple[int, ...]:
     return tuple(reversed(common))
 
 
-def check_number(who: str, name: str, value: Any, expected: str, error: type[Exception] = OptionError) -> float:
-    """Require a finite real number."""
-    if not isinstance(value, Real) or isinstance(value, bool) or not abs(float(value)) < float("inf"):
+def check_number(
+    who: str,
+    name: str,
+    value: Any,
+    expected: str,
+    least: float = -LARGEST,
+    most: float = LARGEST,
+    error: type[Exception] = OptionError,
+) -> float:
+    """Require a finite real number in a range, both ends included."""
+    try:
+        number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    except OverflowError:
+        number = math.inf
+    if not least <= number <= most:
         raise error(f"{who}: {name} must be {expected}; got {describe(value)}")
-    return float(value)
+    return number
 
 
 def is_whole(value: Any) -> TypeGuard[int]:

@@ -178,7 +178,7 @@ def _bounds(name: str, value: object) -> tuple[float, float, float]:
     if len(values) != 3:
         raise GridError(f"VoxelGrid: {name} must be a number or (x, y, z); got {describe(value)}")
     expected = "a finite number or (x, y, z)"
-    x, y, z = (check_number("VoxelGrid", name, item, expected, GridError) for item in values)
+    x, y, z = (check_number("VoxelGrid", name, item, expected, error=GridError) for item in values)
     if not max(abs(x), abs(y), abs(z)) <= LARGEST_BOUND:
         raise GridError(f"VoxelGrid: {name} must be at most {LARGEST_BOUND:g}; got {(x, y, z)}")
     return x, y, z
@@ -341,7 +341,7 @@ def depth_planes(near: float | Tensor, far: float | Tensor, num: int, spacing: s
             if value.dim() > 1:
                 raise ShapeError(f"{who}: {name} must be a number or (B,); got {tuple(value.shape)}")
         else:
-            value = like.new_tensor(check_number(who, name, value, "a finite number", GridError))
+            value = like.new_tensor(check_number(who, name, value, "a finite number", error=GridError))
         ends.append(value)
     check_devices(who, near=ends[0], far=ends[1])
     if ends[0].dtype != ends[1].dtype:

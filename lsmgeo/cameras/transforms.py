@@ -280,9 +280,7 @@ def perturb(
         True
     """
     who = "perturb"
-    degrees = check_number(who, "degrees", degrees, "a number of degrees from 0 to 180")
-    if not 0 <= degrees <= 180:
-        raise OptionError(f"{who}: degrees must be a number of degrees from 0 to 180; got {degrees}")
+    degrees = check_number(who, "degrees", degrees, "a number of degrees from 0 to 180", 0, 180)
     if generator is not None and not isinstance(generator, torch.Generator):
         raise DTypeError(f"{who}: generator must be a torch.Generator or None; got {describe(generator)}")
     tensors = as_tensors(cameras, who)

@@ -129,9 +129,7 @@ def _colour(who: str, background: str | Sequence[float]) -> tuple[float, float, 
     values = tuple(background) if isinstance(background, Sequence) else ()
     if len(values) != 3:
         raise OptionError(f"{who}: background must be 'black', 'white' or (r, g, b); got {describe(background)}")
-    red, green, blue = (check_number(who, "background", value, "numbers in [0, 1]") for value in values)
-    if not all(0 <= value <= 1 for value in (red, green, blue)):
-        raise OptionError(f"{who}: background must have numbers in [0, 1]; got {values}")
+    red, green, blue = (check_number(who, "background", value, "numbers in [0, 1]", 0, 1) for value in values)
     return red, green, blue
 
 

@@ -183,8 +183,7 @@ def hull_box(
     """
     who = "hull_box"
     tensors = as_tensors(cameras, who)
-    if check_number(who, "margin", margin, "a number, 0 at least") < 0:
-        raise OptionError(f"{who}: margin must be 0 at least; got {margin}")
+    check_number(who, "margin", margin, "a number, 0 at least", 0)
     leading = tuple(tensors.intrinsics.shape[:-2])
     if len(leading) != 1:
         raise ShapeError(f"{who}: cameras must have the leading shape (V,); got {leading}")

@@ -96,9 +96,9 @@ class ShapeDataset(Dataset[Sample]):
         self.occupancy = occupancy
         self.background = make_background(background)
         self.on_error = check_choice("ShapeDataset", "on_error", on_error, ("raise", "skip"))
-        self.max_bad_fraction = check_number("ShapeDataset", "max_bad_fraction", max_bad_fraction, "a share in [0, 1]")
-        if not 0 <= self.max_bad_fraction <= 1:
-            raise OptionError(f"ShapeDataset: max_bad_fraction must be a share in [0, 1]; got {max_bad_fraction!r}")
+        self.max_bad_fraction = check_number(
+            "ShapeDataset", "max_bad_fraction", max_bad_fraction, "a share in [0, 1]", 0, 1
+        )
         self.bad_samples = Path(bad_samples if bad_samples is not None else shards.folder / "bad_samples.jsonl")
         self.epoch = 0
         self.indices = _filtered(shards, categories, split)

@@ -16,7 +16,7 @@ from lsmgeo.cameras.tensors import Cameras, check_cameras
 from lsmgeo.cameras.transforms import common_size
 from lsmgeo.data.mesh_topology import corner_normals, face_normals
 from lsmgeo.data.meshes import DEFAULT_COLOUR, Mesh, check_mesh
-from lsmgeo.errors import BackendError, OptionError, ShapeError
+from lsmgeo.errors import BackendError, ShapeError
 from lsmgeo.scenes import Lights, Rendering, shade
 from lsmgeo.scenes.inputs import behind, checked_lights
 
@@ -92,8 +92,7 @@ def render_mesh(
     check_flag(who, "shadows", shadows)
     check_flag(who, "smooth", smooth)
     check_choice(who, "backend", backend, ("auto", *BACKENDS))
-    if not 0 <= check_number(who, "crease", crease, "degrees, 0 to 180") <= 180:
-        raise OptionError(f"{who}: crease must be degrees, 0 to 180; got {crease!r}")
+    check_number(who, "crease", crease, "degrees, 0 to 180", 0, 180)
     tensors = as_tensors(cameras, who)
     if tensors.intrinsics.dim() != 3:
         raise ShapeError(f"{who}: cameras must have the leading shape (V,); got {tuple(tensors.intrinsics.shape[:-2])}")

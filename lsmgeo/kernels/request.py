@@ -81,9 +81,7 @@ class Options(NamedTuple):
         statistics = () if reduce is None else check_choices(who, "reduce", reduce, STATISTICS)
         if reduce is not None and not statistics:
             raise OptionError(f"{who}: reduce must be None or name a statistic; got {describe(reduce)}")
-        distance = check_number(who, "near", near, "a finite number, at least 0")
-        if distance < 0:
-            raise OptionError(f"{who}: near must be a finite number, at least 0; got {near}")
+        distance = check_number(who, "near", near, "a finite number, at least 0", 0)
         return cls(
             mode, padding_mode, "depth" in extra, frame if "direction" in extra else "", statistics, distance, stacked
         )

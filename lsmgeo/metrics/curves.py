@@ -142,10 +142,7 @@ def _check_options(
         raise OptionError(f"{who}: threshold goes with statistic='bad'; got {describe(threshold)} with {statistic!r}")
     if threshold is None:
         return wanted, None
-    limit = check_number(who, "threshold", threshold, "at least 0")
-    if limit < 0:
-        raise OptionError(f"{who}: threshold must be at least 0; got {threshold}")
-    return wanted, limit
+    return wanted, check_number(who, "threshold", threshold, "at least 0", 0)
 
 
 def _taken(who: str, errors: Tensor, confidence: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lsmgeo._checks import check_choice, check_devices, check_float, check_mask, check_number, check_positive
-from lsmgeo.errors import OptionError, ShapeError
+from lsmgeo.errors import ShapeError
 
 __all__ = ["BadPixels", "DepthErrors", "MedianDepthError", "bad_pixel_rate", "depth_errors", "median_depth_error"]
 
@@ -130,9 +130,7 @@ def bad_pixel_rate(
         0.5
     """
     who = "bad_pixel_rate"
-    limit = check_number(who, "threshold", threshold, "at least 0")
-    if limit < 0:
-        raise OptionError(f"{who}: threshold must be at least 0; got {threshold}")
+    limit = check_number(who, "threshold", threshold, "at least 0", 0)
     check_choice(who, "missing", missing, ("skip", "bad"))
     _check_maps(who, "true", predicted, true, mask)
     p, t = predicted.double(), true.double()

@@ -149,7 +149,7 @@ def test_bad_input_is_refused(tmp_path):
         ({"views": [3]}, "views must be numbers from 0 to 2"),
         ({"background": "green"}, "background must be one of"),
         ({"background": (0, 0)}, "background must be"),
-        ({"background": (0, 0, 2)}, "background must have numbers"),
+        ({"background": (0, 0, 2)}, "background must be numbers"),
         ({"background": "black", "folder": tmp_path}, "not both"),
     ):
         with pytest.raises(OptionError, match=expected):

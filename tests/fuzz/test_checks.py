@@ -168,7 +168,7 @@ MISTAKES = {
     "negative near": (
         lambda: Unproject(near=-1.0),
         OptionError,
-        "Unproject: near must be a finite number, at least 0; got -1.0",
+        "Unproject: near must be a finite number, at least 0; got float -1.0",
     ),
     "unknown backend": (
         lambda: Unproject(backend="cuda"),
@@ -352,3 +352,8 @@ def test_errors_are_caught_as_what_python_calls_them():
         unproject(None)
     with pytest.raises(LsmGeoError, match="features"):
         unproject(None)
+
+
+def test_a_whole_number_of_any_length_is_no_finite_number():
+    with pytest.raises(OptionError, match="near must be a finite number"):
+        Unproject(near=10**400)

@@ -45,9 +45,8 @@ class Options:
         check_number("evaluate", "threshold", self.threshold, "a number")
         for name, least in (("batch", 1), ("seed", 0), ("orders", 2), ("planes", 3), ("window", 1)):
             check_whole("evaluate", name, getattr(self, name), least, 2**32 - 1)
-        angles = [check_number("evaluate", "degrees", angle, "degrees from 0 to 180") for angle in self.degrees]
-        if not angles or not all(0 <= angle <= 180 for angle in angles):
-            raise OptionError(f"evaluate: degrees must be from 0 to 180; got {self.degrees}")
+        if not [check_number("evaluate", "degrees", angle, "from 0 to 180", 0, 180) for angle in self.degrees]:
+            raise OptionError("evaluate: degrees must be from 0 to 180; got none")
 
     def views_of(self, usual: int, there: int, notes: list[str]) -> int:
         """How many views are taken: those asked for or the usual number, as far as the data go, which is noted."""

@@ -23,7 +23,7 @@ from lsmgeo.errors import OptionError
 from lsmgeo.metrics import DepthError, VoxelIoU
 from lsmgeo.models import Model, evaluation, load, training
 from lsmgeo.models.evaluation.report import finite
-from lsmgeo.models.evaluation.shapes import SizedShapes, batches
+from lsmgeo.models.evaluation.shapes import batches
 from lsmgeo.models.training.checkpoints import load_latest
 from lsmgeo.models.training.evaluating import evaluate_model
 from lsmgeo.models.training.feeding import Need, open_shapes, validation_batches
@@ -125,7 +125,7 @@ def evaluate_test(experiment: Experiment, model: Model, validation: dict[str, An
     shapes = evaluation.open_shapes(folder.set, size=model.image_size, shapes=TEST_SHAPES * CATEGORIES)
     about = f"{len(shapes)} test shapes of the set of the experiments"
     if model.output == "depth":
-        return {"data": about, "depth_error": depth_by_views(model, SizedShapes(shapes, model.image_size))}
+        return {"data": about, "depth_error": depth_by_views(model, shapes.at(model.image_size))}
     by_threshold = validation.get("iou by threshold", {"0.4": 0.0})
     threshold = float(max(by_threshold, key=lambda level: by_threshold[level]))
     method = evaluation.Contender(model.name, model)

@@ -23,9 +23,9 @@ from lsmgeo.data.r2n2 import read_r2n2
 from lsmgeo.data.render_set import Made, render_set
 from lsmgeo.data.sample import Batch, Sample, check_sample, collate
 from lsmgeo.data.scene_writers import write_cameras_json, write_colmap, write_transforms
-from lsmgeo.data.shard_reading import ShardSet
 from lsmgeo.data.shards import hash_settings, verify_shard, write_shard
-from lsmgeo.data.sources import Recipe
+from lsmgeo.data.shards.read_shards import ShardSet
+from lsmgeo.data.shards.shape_sources import Recipe
 from lsmgeo.data.strecha import read_strecha
 from lsmgeo.data.transforms_json import read_transforms
 from lsmgeo.data.voxelise import voxelise

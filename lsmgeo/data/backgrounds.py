@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -22,63 +22,42 @@ class BackgroundError(DataError):
     """A background cannot be had, which is no fault of the shape before it."""
 
 
-class BackgroundSource(Protocol):
-    """Something that draws backgrounds; it can be sent to another process."""
-
-    @property
-    def is_random(self) -> bool:
-        """Whether it needs a generator."""
-
-    def __call__(self, generator: np.random.Generator | None, height: int, width: int) -> np.ndarray:
-        """(3, H, W) float32 in [0, 1], or (3, 1, 1)."""
-
-
+BackgroundSource: TypeAlias = Callable[[np.random.Generator | None, int, int], np.ndarray]
+"""What draws a background with a generator, height and width: (3, H, W) or (3, 1, 1) float32 in [0, 1]."""
 Background: TypeAlias = str | os.PathLike[str] | Sequence[float] | BackgroundSource
 
 
-@dataclass(frozen=True)
-class _Plain:
-    colour: tuple[float, float, float]
-    is_random: bool = False
-
-    def __call__(self, generator: np.random.Generator | None, height: int, width: int) -> np.ndarray:
-        return np.array(self.colour, np.float32).reshape(3, 1, 1)
+def _plain(
+    colour: tuple[float, float, float], generator: np.random.Generator | None, height: int, width: int
+) -> np.ndarray:
+    return np.array(colour, np.float32).reshape(3, 1, 1)
 
 
-@dataclass(frozen=True)
-class _Analytic:
-    is_random: bool = True
+def _analytic(generator: np.random.Generator | None, height: int, width: int) -> np.ndarray:
+    from lsmgeo import scenes
 
-    def __call__(self, generator: np.random.Generator | None, height: int, width: int) -> np.ndarray:
-        from lsmgeo import scenes
-
-        if generator is None:
-            raise OptionError("background: 'random' needs a generator")
-        return np.asarray(scenes.background(generator, height, width), np.float32)
+    if generator is None:
+        raise OptionError("background: 'random' needs a generator")
+    return np.asarray(scenes.background(generator, height, width), np.float32)
 
 
-@dataclass(frozen=True)
-class _Folder:
-    """Cuttings of photographs: any place, half to all of the largest size that fits, scaled to what is needed."""
+def _cutting(
+    folder: Path, names: tuple[str, ...], generator: np.random.Generator | None, height: int, width: int
+) -> np.ndarray:
+    """A cutting of a photograph: any place, half to all of the largest size that fits, scaled to what is needed."""
+    from PIL import Image
 
-    folder: Path
-    names: tuple[str, ...]
-    is_random: bool = True
-
-    def __call__(self, generator: np.random.Generator | None, height: int, width: int) -> np.ndarray:
-        from PIL import Image
-
-        if generator is None:
-            raise OptionError("background: a folder of pictures needs a generator")
-        name = self.names[int(generator.random() * len(self.names))]
-        pixels = read_image(child(self.folder, name, self.folder))
-        scale = min(pixels.shape[0] / height, pixels.shape[1] / width) * (0.5 + 0.5 * generator.random())
-        tall, wide = (max(1, round(side * scale)) for side in (height, width))
-        top = int(generator.random() * (pixels.shape[0] - tall + 1))
-        left = int(generator.random() * (pixels.shape[1] - wide + 1))
-        cutting = Image.fromarray(pixels[top : top + tall, left : left + wide])
-        resized = np.asarray(cutting.resize((width, height), Image.Resampling.BILINEAR))
-        return resized.transpose(2, 0, 1).astype(np.float32) / np.float32(255)
+    if generator is None:
+        raise OptionError("background: a folder of pictures needs a generator")
+    name = names[int(generator.random() * len(names))]
+    pixels = read_image(child(folder, name, folder))
+    scale = min(pixels.shape[0] / height, pixels.shape[1] / width) * (0.5 + 0.5 * generator.random())
+    tall, wide = (max(1, round(side * scale)) for side in (height, width))
+    top = int(generator.random() * (pixels.shape[0] - tall + 1))
+    left = int(generator.random() * (pixels.shape[1] - wide + 1))
+    cutting = Image.fromarray(pixels[top : top + tall, left : left + wide])
+    resized = np.asarray(cutting.resize((width, height), Image.Resampling.BILINEAR))
+    return resized.transpose(2, 0, 1).astype(np.float32) / np.float32(255)
 
 
 def make_background(background: Background) -> BackgroundSource:
@@ -96,12 +75,10 @@ def make_background(background: Background) -> BackgroundSource:
         >>> make_background("white")(None, 48, 64).ravel().tolist()
         [1.0, 1.0, 1.0]
     """
-    if isinstance(background, (_Plain, _Analytic, _Folder)):
-        return background
     if background == "white":
-        return _Plain((1.0, 1.0, 1.0))
+        return partial(_plain, (1.0, 1.0, 1.0))
     if background == "random":
-        return _Analytic()
+        return _analytic
     if isinstance(background, (str, os.PathLike)):
         return _folder(Path(background))
     if callable(background):
@@ -114,7 +91,7 @@ def make_background(background: Background) -> BackgroundSource:
         raise OptionError(
             f"background must be 'white', 'random', three numbers in [0, 1] or a folder; got {describe(background)}"
         )
-    return _Plain((values[0], values[1], values[2]))
+    return partial(_plain, (values[0], values[1], values[2]))
 
 
 def _folder(folder: Path) -> BackgroundSource:
@@ -124,4 +101,4 @@ def _folder(folder: Path) -> BackgroundSource:
         raise DataError(folder, f"is no folder of backgrounds, 'white' or 'random' ({error})") from error
     if not names:
         raise DataError(folder, "holds no PNG or JPEG picture")
-    return _Folder(folder, names)
+    return partial(_cutting, folder, names)

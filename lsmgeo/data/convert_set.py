@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
 import re
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -16,25 +14,21 @@ import torch
 from lsmgeo._checks import check_flag, check_whole
 from lsmgeo.data.files import refusing
 from lsmgeo.data.json_files import read_json
-from lsmgeo.data.lsm_release import find_lsm, read_lsm_objects
+from lsmgeo.data.lsm_release import read_lsm_object
 from lsmgeo.data.metadata import MAX_SIDE, MAX_VOXELS
-from lsmgeo.data.posed import PosedImages
 from lsmgeo.data.r2n2 import METADATA, read_r2n2
 from lsmgeo.data.render_set import Made, make_set
 from lsmgeo.data.sample import Sample
-from lsmgeo.data.sources import Recipe, Rendered, split_by_name
-from lsmgeo.errors import DataError, LsmGeoError
+from lsmgeo.data.shards.shape_sources import FileSource, Recipe, Rendered, rendered, sort_paths, split_by_name, walk
+from lsmgeo.errors import DataError
 
 __all__ = ["LsmTree", "ObjectTree", "R2n2Tree", "convert_set", "open_tree", "read_splits"]
 
 VERSION = 1
 IDENTIFIER = re.compile(r"[A-Za-z0-9_-]{1,128}")
 PARTS = ("train", "val", "test")
-MAX_OBJECTS = 1_000_000
 # What a shard's 16-bit depth reaches at its default step.
 MAX_DEPTH = 65535 * 5e-5
-# Objects whose MATLAB files are read together: a process costs as much as some hundred files.
-AHEAD = 50
 
 
 def convert_set(
@@ -142,78 +136,38 @@ def read_splits(path: str | Path) -> Splits:
 
 
 @dataclass(frozen=True)
-class ObjectTree(ABC):
-    """Objects below a folder, in the order of their paths, with the views and voxels that they came with.
+class ObjectTree(FileSource):
+    """Objects with the views and voxels that they came with; their paths are those of their folders.
 
     Attributes:
-        root: the folder.
-        objects: their folders, relative to the root, with forward slashes.
-        name: what its shards are called.
         splits: the part of the set of each object, or None: by name.
-        first: the number of the first object.
     """
 
-    root: Path
-    objects: tuple[str, ...]
-    name: str
     splits: Splits | None = None
-    first: int = 0
-
-    def __len__(self) -> int:
-        return len(self.objects)
 
     def part(self, start: int, stop: int) -> Self:
         """These objects alone."""
-        objects = self.objects[start - self.first : stop - self.first]
-        splits = self.splits
-        if splits is not None:
-            known = splits.part_of
-            splits = splits._replace(part_of={key: known[key] for name in objects if (key := _key(name)) in known})
-        return replace(self, objects=objects, splits=splits, first=start)
+        some = super().part(start, stop)
+        if some.splits is None:
+            return some
+        known = some.splits.part_of
+        part_of = {key: known[key] for path in some.paths if (key := _key(path)) in known}
+        return replace(some, splits=some.splits._replace(part_of=part_of))
 
     def identity(self) -> Any:
         """SHA-256 of the files of all objects, and where they go."""
         parts = None if self.splits is None else sorted(self.splits.part_of.items())
-        return [VERSION, type(self).__name__, parts, [[name, *self._digests(name)] for name in self.objects]]
+        files = [[path, *(f"{name} {digest}".strip() for name, digest in self.digests(path))] for path in self.paths]
+        return [VERSION, type(self).__name__, parts, files]
 
-    def _digests(self, name: str) -> list[str]:
-        digests = []
-        try:
-            for file in self._files(self.root / name):
-                with file.open("rb") as stream:
-                    digests.append(f"{file.name} {hashlib.file_digest(stream, 'sha256').hexdigest()}")
-        except OSError as error:
-            return [f"cannot be read ({error})"]
-        return digests
-
-    def file(self, index: int) -> str:
-        """Its folder."""
-        return str(self.root / self.objects[index - self.first])
-
-    def render(self, index: int, recipe: Recipe) -> Rendered:
-        """The views and voxels of one object, as they are in its files.
-
-        Raises:
-            DataError: a file cannot be used, the object is in no part of the set, or lacks what the set holds.
-        """
-        name, folder = self.objects[index - self.first], Path(self.file(index))
-        key = _key(name)
+    def _render(self, index: int, recipe: Recipe) -> Rendered:
+        key, folder = _key(self.paths[index - self.first]), Path(self.file(index))
         if self.splits is not None and key not in self.splits.part_of:
             raise DataError(folder, f"is in no part of {self.splits.file}")
-        try:
-            sample, grids = self._read(index, recipe)
-        except DataError:
-            raise
-        except LsmGeoError as error:  # what only shows when views are put together: pictures of two sizes
-            raise DataError(folder, str(error)) from error
+        sample, grids = self._read(index, recipe)
         _check(sample, grids, folder)
         split = split_by_name(key) if self.splits is None else self.splits.part_of[key]
-        occupancy = grids[0] if grids else None
-        return Rendered(sample._replace(occupancy=occupancy, name=key), grids[1:], split)
-
-    @abstractmethod
-    def _files(self, folder: Path) -> list[Path]:
-        """What an object is made from, sorted."""
+        return rendered(sample._replace(name=key), grids, split)
 
     @abstractmethod
     def _read(self, index: int, recipe: Recipe) -> tuple[Sample, tuple[torch.Tensor, ...]]:
@@ -235,16 +189,8 @@ def _check(sample: Sample, grids: tuple[torch.Tensor, ...], folder: Path) -> Non
         raise DataError(folder, f"has depth beyond {MAX_DEPTH:.4g}, which a shard's depth does not reach")
 
 
-@dataclass(frozen=True)
 class LsmTree(ObjectTree):
     """The LSM release: ``renders/SYNSET/MODEL`` and ``voxels`` beside ``renders``."""
-
-    # Objects read ahead; a source belongs to one task, which takes each of them once.
-    _ahead: dict[int, Any] = field(default_factory=dict, repr=False, compare=False)
-
-    def part(self, start: int, stop: int) -> Self:
-        """These objects alone, with nothing read yet."""
-        return replace(super().part(start, stop), _ahead={})
 
     def _files(self, folder: Path) -> list[Path]:
         solids = (self.root / "voxels").glob(f"modelVoxels*/{folder.parent.name}/{folder.name}.mat")
@@ -252,14 +198,8 @@ class LsmTree(ObjectTree):
         return sorted([*renders, *solids])
 
     def _read(self, index: int, recipe: Recipe) -> tuple[Sample, tuple[torch.Tensor, ...]]:
-        if index not in self._ahead:
-            self._read_ahead(index, recipe)
-        found = self._ahead.pop(index)
-        if isinstance(found, DataError):
-            raise found
-        scene: PosedImages
-        scene, grids = found
         folder = Path(self.file(index))
+        scene, grids = read_lsm_object(folder, recipe.voxels)
         if len(grids) != len(recipe.voxels):
             raise DataError(folder, f"lacks voxels: {len(grids)} of the resolutions {recipe.voxels} are there")
         sample = (scene if recipe.depth else replace(scene, depths=None)).sample()
@@ -267,17 +207,7 @@ class LsmTree(ObjectTree):
             raise DataError(folder, "lacks the depth of a view")
         return sample, grids
 
-    def _read_ahead(self, index: int, recipe: Recipe) -> None:
-        objects = {}
-        for other in range(index, min(index + AHEAD, self.first + len(self.objects))):
-            try:
-                objects[other] = find_lsm(Path(self.file(other)), recipe.voxels)
-            except DataError as error:
-                self._ahead[other] = error
-        self._ahead.update(zip(objects, read_lsm_objects(list(objects.values())), strict=True))
 
-
-@dataclass(frozen=True)
 class R2n2Tree(ObjectTree):
     """3D-R2N2's renderings: folders with ``rendering/rendering_metadata.txt``, and their voxels.
 
@@ -285,11 +215,10 @@ class R2n2Tree(ObjectTree):
     """
 
     def _files(self, folder: Path) -> list[Path]:
-        solid = self.root / "ShapeNetVox32" / folder.parent.name / folder.name / "model.binvox"
-        solids = [file for file in (folder / "model.binvox", solid) if file.is_file()]
-        return sorted(
-            [*(file for file in (folder / "rendering").iterdir() if file.suffix in (".png", ".txt")), *solids]
-        )
+        apart = self.root / "ShapeNetVox32" / folder.parent.name / folder.name / "model.binvox"
+        solids = (file for file in (folder / "model.binvox", apart) if file.is_file())
+        renders = (file for file in (folder / "rendering").iterdir() if file.suffix in (".png", ".txt"))
+        return sorted([*renders, *solids])
 
     def _read(self, index: int, recipe: Recipe) -> tuple[Sample, tuple[torch.Tensor, ...]]:
         folder = Path(self.file(index))
@@ -312,35 +241,23 @@ def open_tree(source: str | Path, splits: str | Path | None = None) -> ObjectTre
         raise DataError(root, "is no folder of rendered objects")
     root = root.resolve()
     kind: type[ObjectTree] = LsmTree if (root / "renders").is_dir() else R2n2Tree
-    found = sorted(_find_lsm_folders(root) if kind is LsmTree else _find_r2n2_folders(root))
-    if not found:
-        raise DataError(root, f"holds neither renders/SYNSET/MODEL nor MODEL/rendering/{METADATA}")
-    if len(found) > MAX_OBJECTS:
-        raise DataError(root, f"holds {len(found)} objects, the limit is {MAX_OBJECTS}")
+    folders = _lsm_folders(root) if kind is LsmTree else _r2n2_folders(root)
+    found = sort_paths(root, folders, f"renders/SYNSET/MODEL or MODEL/rendering/{METADATA}")
     strange = next((name for name in found if not all(IDENTIFIER.fullmatch(part) for part in name.split("/"))), None)
     if strange is not None:
         raise DataError(root, f"holds an object whose name is none: {strange[:80]!r}")
     name = root.name.lstrip(".") or "objects"
-    return kind(root, tuple(found), name, None if splits is None else read_splits(splits))
+    return kind(root, found, name, splits=None if splits is None else read_splits(splits))
 
 
-def _find_lsm_folders(root: Path) -> list[str]:
-    found = []
+def _lsm_folders(root: Path) -> Iterator[Path]:
     with refusing(root, "read"):
         for synset in (root / "renders").iterdir():
             if synset.is_dir() and not synset.is_symlink():
-                models = (folder for folder in synset.iterdir() if folder.is_dir() and not folder.is_symlink())
-                found += [folder.relative_to(root).as_posix() for folder in models]
-    return found
+                yield from (folder for folder in synset.iterdir() if folder.is_dir() and not folder.is_symlink())
 
 
-def _find_r2n2_folders(root: Path) -> list[str]:
-    def refuse(error: OSError) -> None:
-        raise DataError(error.filename or root, f"cannot be read ({error})") from error
-
-    found = []
-    for folder, _, names in os.walk(root, onerror=refuse):  # links to folders are not followed
-        path = Path(folder)
-        if path.name == "rendering" and METADATA in names and path.parent != root:
-            found.append(path.parent.relative_to(root).as_posix())
-    return found
+def _r2n2_folders(root: Path) -> Iterator[Path]:
+    for folder, names in walk(root):
+        if folder.name == "rendering" and METADATA in names and folder.parent != root:
+            yield folder.parent

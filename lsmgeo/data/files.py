@@ -207,10 +207,6 @@ class AtomicFile:
             while rest:
                 rest = rest[os.write(self._descriptor, rest) :]
 
-    def fileno(self) -> int:
-        """The descriptor of the temporary file."""
-        return self._descriptor
-
 
 @contextlib.contextmanager
 def atomic_file(path: str | os.PathLike[str]) -> Iterator[AtomicFile]:

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import TypedDict
 
 import numpy as np
 from torch.utils.data import Dataset, Sampler
@@ -18,10 +17,10 @@ from torch.utils.data import Dataset, Sampler
 from lsmgeo._checks import check_choice, check_flag, check_number, check_whole, describe, is_whole
 from lsmgeo.data.backgrounds import Background, BackgroundError, make_background
 from lsmgeo.data.sample import Sample
-from lsmgeo.data.shard_reading import ShardSet
+from lsmgeo.data.shards.shape_sets import ShapeSet
 from lsmgeo.errors import DataError, OptionError
 
-__all__ = ["EpochSampler", "SamplerState", "ShapeDataset"]
+__all__ = ["EpochSampler", "ShapeDataset"]
 
 SUBSTITUTES = 16  # shapes tried in a bad one's place
 
@@ -29,9 +28,8 @@ SUBSTITUTES = 16  # shapes tried in a bad one's place
 class ShapeDataset(Dataset[Sample]):
     """The shapes of shards as a map-style data set, each time with other views.
 
-    An item is ``dataset[(epoch, index)]``, which is what `EpochSampler` asks for, or ``dataset[index]`` in the epoch of
-    `set_epoch`. A loader's workers hold copies of the data set, and persistent ones never hear of a later `set_epoch`;
-    the pairs reach them all. The item depends on seed, epoch and index alone.
+    An item is ``dataset[(epoch, index)]``, which is what `EpochSampler` asks for; ``dataset[index]`` is of epoch 0. It
+    depends on seed, epoch and index alone.
 
     A shape that cannot be read raises a `DataError` that names its shard (through a loader's worker a ``RuntimeError``
     with its text). With ``on_error="skip"`` another shape stands in for it, drawn by a hash of seed, epoch and index;
@@ -76,7 +74,7 @@ class ShapeDataset(Dataset[Sample]):
 
     def __init__(
         self,
-        shards: ShardSet,
+        shards: ShapeSet,
         *,
         views: int | tuple[int, int] | None = 4,
         seed: int = 0,
@@ -100,7 +98,6 @@ class ShapeDataset(Dataset[Sample]):
             "ShapeDataset", "max_bad_fraction", max_bad_fraction, "a share in [0, 1]", 0, 1
         )
         self.bad_samples = Path(bad_samples if bad_samples is not None else shards.folder / "bad_samples.jsonl")
-        self.epoch = 0
         self.indices = _filtered(shards, categories, split)
         self._bad: set[int] = set()
         counts = shards.view_counts[self.indices]
@@ -117,16 +114,8 @@ class ShapeDataset(Dataset[Sample]):
         """The names of the shapes, in the order of their indices."""
         return [self.shards.names[index] for index in self.indices.tolist()]
 
-    def set_epoch(self, epoch: int) -> None:
-        """Draw the views of this epoch for items asked for by index alone.
-
-        Args:
-            epoch: at least 0. Workers that run already do not hear of it: use `EpochSampler`.
-        """
-        self.epoch = check_whole("ShapeDataset", "epoch", epoch, 0)
-
     def __getitem__(self, item: int | tuple[int, int]) -> Sample:
-        pair = item if isinstance(item, (tuple, list)) else (self.epoch, item)
+        pair = item if isinstance(item, (tuple, list)) else (0, item)
         if len(pair) != 2:
             raise OptionError(f"ShapeDataset: an item is an index or (epoch, index); got {describe(item)}")
         epoch, index = pair
@@ -135,23 +124,17 @@ class ShapeDataset(Dataset[Sample]):
                 raise IndexError(f"ShapeDataset: index must be from 0 to {len(self) - 1}; got {index}")
             raise OptionError(f"ShapeDataset: an item is an index or (epoch, index); got {describe(item)}")
         epoch, index = check_whole("ShapeDataset", "epoch", epoch, 0), int(index)
-        try:
-            return self._read(epoch, index, 0)
-        except DataError as error:
-            if self.on_error == "raise" or isinstance(error, BackgroundError):
-                raise
-            self._report(epoch, index, error)
-        for attempt in range(1, SUBSTITUTES + 1):
+        for attempt in range(SUBSTITUTES + 1):
             drawn = np.random.SeedSequence([self.seed, epoch, index, attempt]).generate_state(1, np.uint64)
-            substitute = int(drawn[0]) % len(self)
-            if substitute == index:
+            place = int(drawn[0]) % len(self) if attempt else index
+            if attempt and place == index:
                 continue
             try:
-                return self._read(epoch, substitute, attempt)
-            except BackgroundError:
-                raise
+                return self._read(epoch, place, attempt)
             except DataError as error:
-                self._report(epoch, substitute, error)
+                if self.on_error == "raise" or isinstance(error, BackgroundError):
+                    raise
+                self._report(epoch, place, error)
         raise DataError(
             self.shards.folder, f"found no shape in the place of {self.names[index]} in {SUBSTITUTES} tries"
         )
@@ -193,14 +176,6 @@ class ShapeDataset(Dataset[Sample]):
                 f"{error.reason}; with this, {len(self._bad)} of {len(self)} shapes are bad, more than the "
                 f"{self.max_bad_fraction:g} that max_bad_fraction allows (see {self.bad_samples})",
             ) from error
-
-
-class SamplerState(TypedDict):
-    """Where an order of samples stands."""
-
-    epoch: int
-    position: int
-    seed: int
 
 
 class EpochSampler(Sampler[tuple[int, int]]):
@@ -264,11 +239,11 @@ class EpochSampler(Sampler[tuple[int, int]]):
         self.epoch = check_whole("EpochSampler", "epoch", epoch, 0)
         self.position = check_whole("EpochSampler", "position", position, 0)
 
-    def state_dict(self) -> SamplerState:
+    def state_dict(self) -> dict[str, int]:
         """Epoch, position and seed, as last set."""
         return {"epoch": self.epoch, "position": self.position, "seed": self.seed}
 
-    def load_state_dict(self, state: SamplerState) -> None:
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
         """Go where a state says; length, rank and world size stay.
 
         Raises:
@@ -313,7 +288,7 @@ def _view_range(views: int | tuple[int, int] | None) -> tuple[int, int] | None:
     return low, high
 
 
-def _filtered(shards: ShardSet, categories: Collection[str] | None, split: str | None) -> np.ndarray:
+def _filtered(shards: ShapeSet, categories: Collection[str] | None, split: str | None) -> np.ndarray:
     """The indices of the shapes that are wanted, ascending."""
     wanted = np.ones(len(shards), bool)
     if isinstance(categories, str):

@@ -6,7 +6,7 @@ import re
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -19,13 +19,14 @@ from lsmgeo.data.isolated import isolated
 from lsmgeo.data.mat_files import parse_mat
 from lsmgeo.data.metadata import MAX_VIEWS
 from lsmgeo.data.posed import PosedImages, Voxels, assemble, check_camera, check_last_row, make_cameras
+from lsmgeo.data.shards.shape_sources import spell_synset
 from lsmgeo.errors import DataError, OptionError
 from lsmgeo.grids import VoxelGrid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["LsmObject", "find_lsm", "is_lsm", "read_lsm", "read_lsm_objects", "read_mats", "spell_synset"]
+__all__ = ["is_lsm", "read_lsm", "read_lsm_object", "read_mats"]
 
 RENDER = re.compile(r"render_(0|[1-9][0-9]{0,4})\.png")
 RESOLUTIONS = (32, 64)
@@ -39,22 +40,6 @@ MEMORY = 1 << 29
 SECONDS = 60.0
 
 Arrays = dict[str, np.ndarray]
-
-
-class LsmObject(NamedTuple):
-    """The files of one object.
-
-    Attributes:
-        folder: where its renderings lie.
-        views: their numbers, ascending.
-        cameras: the MATLAB file of each view's camera.
-        volumes: resolution and MATLAB file of the voxels that are there.
-    """
-
-    folder: Path
-    views: tuple[int, ...]
-    cameras: tuple[Path, ...]
-    volumes: tuple[tuple[int, Path], ...]
 
 
 def is_lsm(path: Path) -> bool:
@@ -88,53 +73,37 @@ def read_lsm(path: str | Path, *, voxels: int = 32) -> PosedImages:
         OptionError: another resolution, or SciPy is missing.
     """
     check_choice("read_lsm", "voxels", str(voxels), tuple(map(str, RESOLUTIONS)))
-    (found,) = read_lsm_objects([find_lsm(Path(path), (voxels,))])
-    if isinstance(found, DataError):
-        raise found
-    scene, grids = found
+    scene, grids = read_lsm_object(Path(path), (voxels,))
     return scene if not grids else replace(scene, voxels=Voxels(grids[0], VoxelGrid(len(grids[0]))))
 
 
-def find_lsm(folder: Path, resolutions: Sequence[int]) -> LsmObject:
-    """Find the files of one object.
+def read_lsm_object(folder: Path, resolutions: Sequence[int]) -> tuple[PosedImages, tuple[torch.Tensor, ...]]:
+    """Read one object without voxels, and its occupancy (n, n, n) of the resolutions that are there.
 
     Raises:
-        DataError: no view, a view without camera, or too many.
+        DataError: no view, too many, or a file that is missing, damaged, or crashes its parser.
     """
     try:
-        numbers = [int(match[1]) for file in folder.iterdir() if (match := RENDER.fullmatch(file.name))]
+        views = sorted(int(match[1]) for file in folder.iterdir() if (match := RENDER.fullmatch(file.name)))
         root = folder.resolve().parents[2]
         synset, model = folder.resolve().parts[-2:]
         files = [(side, root / "voxels" / f"modelVoxels{side}" / synset / f"{model}.mat") for side in resolutions]
-        volumes = tuple(
-            (side, child(root, str(file.relative_to(root)), folder)) for side, file in files if file.exists()
-        )
+        volumes = [(side, child(root, str(file.relative_to(root)), folder)) for side, file in files if file.exists()]
     except (OSError, RuntimeError, IndexError, ValueError) as error:
         if isinstance(error, DataError):
             raise
         raise DataError(folder, f"cannot be read ({error})") from error
-    if not 1 <= len(numbers) <= MAX_VIEWS:
-        raise DataError(folder, f"must hold render_0.png and so on, {MAX_VIEWS} views at most; found {len(numbers)}")
-    views = tuple(sorted(numbers))
-    return LsmObject(folder, views, tuple(child(folder, f"camera_{i}.mat", folder) for i in views), volumes)
-
-
-def read_lsm_objects(objects: Sequence[LsmObject]) -> list[tuple[PosedImages, tuple[torch.Tensor, ...]] | DataError]:
-    """Read objects together, their MATLAB files in one process.
-
-    Returns:
-        For each its scene without voxels, and its occupancy (n, n, n) of each resolution; or why it cannot be used.
-    """
-    paths = [path for found in objects for path in (*found.cameras, *(file for _, file in found.volumes))]
-    mats = dict(zip(paths, read_mats(paths), strict=True))
-    results: list[tuple[PosedImages, tuple[torch.Tensor, ...]] | DataError] = []
-    for found in objects:
-        try:
-            grids = tuple(_occupancy(_arrays(mats[file]), side, file) for side, file in found.volumes)
-            results.append((_scene(found, [_arrays(mats[file]) for file in found.cameras]), grids))
-        except DataError as error:
-            results.append(error)
-    return results
+    if not 1 <= len(views) <= MAX_VIEWS:
+        raise DataError(folder, f"must hold render_0.png and so on, {MAX_VIEWS} views at most; found {len(views)}")
+    cameras = [child(folder, f"camera_{view}.mat", folder) for view in views]
+    arrays = []
+    for found in read_mats([*cameras, *(file for _, file in volumes)]):
+        if isinstance(found, DataError):
+            raise found
+        arrays.append(found)
+    solids = zip(volumes, arrays[len(views) :], strict=True)
+    grids = tuple(_occupancy(found, side, file) for (side, file), found in solids)
+    return _scene(folder, views, list(zip(cameras, arrays[: len(views)], strict=True))), grids
 
 
 def read_mats(paths: Sequence[Path]) -> list[Arrays | DataError]:
@@ -157,16 +126,10 @@ def read_mats(paths: Sequence[Path]) -> list[Arrays | DataError]:
     return results
 
 
-def _arrays(found: Arrays | DataError) -> Arrays:
-    if isinstance(found, DataError):
-        raise found
-    return found
-
-
-def _scene(found: LsmObject, cameras: list[Arrays]) -> PosedImages:
+def _scene(folder: Path, views: Sequence[int], cameras: Sequence[tuple[Path, Arrays]]) -> PosedImages:
     K, E, sizes, depths = [], [], [], []
-    paths = [child(found.folder, f"render_{view}.png", found.folder) for view in found.views]
-    for view, picture, file, arrays in zip(found.views, paths, found.cameras, cameras, strict=True):
+    paths = [child(folder, f"render_{view}.png", folder) for view in views]
+    for view, picture, (file, arrays) in zip(views, paths, cameras, strict=True):
         for name, shape in (("K", (3, 3)), ("extrinsic", (4, 4))):
             if name not in arrays or arrays[name].shape != shape:
                 has = arrays[name].shape if name in arrays else "none"
@@ -177,18 +140,18 @@ def _scene(found: LsmObject, cameras: list[Arrays]) -> PosedImages:
         K.append(intrinsics)
         E.append(extrinsic)
         sizes.append(image_size(picture))
-        depth = child(found.folder, f"depth_{view}.png", found.folder)
+        depth = child(folder, f"depth_{view}.png", folder)
         depths.append(DepthPng(depth, DEPTH_STEP, (NO_DEPTH,)) if depth.exists() else None)
     poses = np.array(E)
     return assemble(
         [path.name for path in paths],
         paths,
-        make_cameras(K, poses[:, :3, :3], poses[:, :3, 3], sizes, found.folder, pixel_center="half"),
+        make_cameras(K, poses[:, :3, :3], poses[:, :3, 3], sizes, folder, pixel_center="half"),
         "lsm",
-        file=found.folder,
+        file=folder,
         depths=depths,
         cut_out=True,
-        category=spell_synset(found.folder.resolve().parent.name),
+        category=spell_synset(folder.resolve().parent.name),
     )
 
 
@@ -199,15 +162,3 @@ def _occupancy(arrays: Arrays, side: int, file: Path) -> torch.Tensor:
         has = "none" if volume is None else volume.shape
         raise DataError(file, f"must hold Volume, {side} x {side} x {side} zeros and ones; found {has}")
     return torch.from_numpy(np.ascontiguousarray(volume[:, :, ::-1].transpose(1, 2, 0)))
-
-
-def spell_synset(synset: str) -> str | None:
-    """The name of a ShapeNet category, or None.
-
-    Example:
-        >>> spell_synset("03001627")
-        'chair'
-    """
-    from lsmgeo.scenes.synthetic13 import CATEGORIES
-
-    return {number: name for name, number in CATEGORIES.items()}.get(synset)

@@ -1,4 +1,4 @@
-"""What a shard holds of one shape: `encode_sample` makes the members, ``decode_*`` read single ones.
+"""What a shard holds of one shape: `encode_sample` makes the members, `decode_occupancy` reads one.
 
 Members of a shape, by suffix and in this order::
 
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from lsmgeo._checks import check_number, check_whole, describe
 from lsmgeo.cameras.tensors import check_cameras
-from lsmgeo.data.images import DEPTH, RGBA, decode_png, encode_png
+from lsmgeo.data.images import encode_png
 from lsmgeo.data.metadata import MAX_SIDE, MAX_VIEWS, MAX_VOXELS, is_text
 from lsmgeo.data.sample import Sample, check_sample
 from lsmgeo.errors import DataError, DTypeError, OptionError, ShapeError
@@ -35,9 +35,7 @@ if TYPE_CHECKING:
 __all__ = [
     "KEY",
     "SUFFIX",
-    "decode_depth",
     "decode_occupancy",
-    "decode_picture",
     "encode_sample",
     "format_key",
 ]
@@ -205,26 +203,6 @@ def _npy(array: np.ndarray) -> bytes:
     stream = io.BytesIO()
     np.lib.format.write_array(stream, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
     return stream.getvalue()
-
-
-def decode_picture(content: bytes, size: tuple[int, int], path: str | PathLike[str], member: str) -> np.ndarray:
-    """(H, W, 4) uint8 of a picture.
-
-    Raises:
-        DataError: not such a PNG, of another size, or damaged.
-    """
-    return decode_png(content, size, RGBA, path, member)
-
-
-def decode_depth(
-    content: bytes, size: tuple[int, int], depth_step: float, path: str | PathLike[str], member: str
-) -> np.ndarray:
-    """(H, W) float32 depth in world units of a depth picture.
-
-    Raises:
-        DataError: not such a PNG, of another size, or damaged.
-    """
-    return decode_png(content, size, DEPTH, path, member).astype(np.float32) * np.float32(depth_step)
 
 
 def decode_occupancy(content: bytes, side: int, path: str | PathLike[str], member: str) -> np.ndarray:

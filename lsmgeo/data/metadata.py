@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -11,18 +11,21 @@ import torch
 from lsmgeo._checks import check_whole, describe
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.cameras.tensors import check_cameras
+from lsmgeo.data.json_files import take_array
 from lsmgeo.errors import DataError, LsmGeoError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from os import PathLike
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
 
-__all__ = ["MAX_SIDE", "MAX_VIEWS", "MAX_VOXELS", "Metadata", "decode_metadata", "is_text"]
+__all__ = ["MAX_SIDE", "MAX_VIEWS", "MAX_VOXELS", "Metadata", "decode_metadata", "decode_texts", "is_text"]
 
 MAX_VIEWS = 1000
 MAX_VOXELS = 256
 MAX_SIDE = 4096
 MAX_BYTES = 1 << 22
+
+Checked = TypeVar("Checked")
 
 
 class Metadata(NamedTuple):
@@ -62,7 +65,7 @@ def is_text(value: Any) -> bool:
     return isinstance(value, str) and value.isprintable() and 0 < len(value) <= 1024
 
 
-def decode_metadata(content: bytes, key: str, path: str | PathLike[str]) -> Metadata:
+def decode_metadata(content: bytes, key: str, path: Path) -> Metadata:
     """Read and check the json of a shape.
 
     Args:
@@ -73,6 +76,15 @@ def decode_metadata(content: bytes, key: str, path: str | PathLike[str]) -> Meta
     Raises:
         DataError: not such a json, or values that make no sense.
     """
+    return _decode(content, key, path, _metadata)
+
+
+def decode_texts(content: bytes, key: str, path: Path) -> dict[str, str | None]:
+    """Of the json of a shape name, category, split, source and mesh alone, checked; see `decode_metadata`."""
+    return _decode(content, key, path, _texts)
+
+
+def _decode(content: bytes, key: str, path: Path, check: Callable[[dict[str, Any], Path, str], Checked]) -> Checked:
     where = f"{key}.json"
     if len(content) > MAX_BYTES:
         raise DataError(path, f"{where} is larger than the limit of {MAX_BYTES} bytes")
@@ -82,7 +94,13 @@ def decode_metadata(content: bytes, key: str, path: str | PathLike[str]) -> Meta
     except (ValueError, RecursionError) as error:
         raise DataError(path, f"{where} is not JSON ({error})") from error
     try:
-        return _metadata(values, key)
+        if not isinstance(values, dict):
+            raise ValueError("expected an object")
+        if values["key"] != key:
+            raise ValueError(f"belongs to key {describe(values['key'])}")
+        return check(values, path, where)
+    except DataError:
+        raise
     except (KeyError, TypeError, ValueError, OverflowError, LsmGeoError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise DataError(path, f"{where}: {reason}") from error
@@ -92,20 +110,17 @@ def _refuse_constant(name: str) -> float:
     raise ValueError(f"holds {name}")
 
 
-def _metadata(values: Any, key: str) -> Metadata:
-    if not isinstance(values, dict):
-        raise ValueError("expected an object")
-    if values["key"] != key:
-        raise ValueError(f"belongs to key {describe(values['key'])}")
-    texts = {}
-    for field in ("name", "category", "split", "source", "mesh"):
-        text = values[field]
+def _texts(values: dict[str, Any], path: Path, where: str) -> dict[str, str | None]:
+    texts = {field: values[field] for field in ("name", "category", "split", "source", "mesh")}
+    for field, text in texts.items():
         if text is not None and not is_text(text):
             raise ValueError(f"{field} must be 1 to 1024 printable characters or null; got {describe(text)}")
-        texts[field] = text
-    name = texts.pop("name")
-    if name is None:
+    if texts["name"] is None:
         raise ValueError("name must be a string; got null")
+    return texts
+
+
+def _metadata(values: dict[str, Any], path: Path, where: str) -> Metadata:
     seed, step, size = values["seed"], values["depth_step"], values["size"]
     if seed is not None:
         seed = check_whole("metadata", "seed", seed, 0)
@@ -123,50 +138,19 @@ def _metadata(values: Any, key: str) -> Metadata:
     cameras = values["cameras"]
     if not isinstance(cameras, dict):
         raise ValueError(f"cameras must be an object; got {describe(cameras)}")
-    K = _matrices("intrinsics", cameras["intrinsics"], views, 3)
-    E = _matrices("cam_from_world", cameras["cam_from_world"], views, 4)
+    K, E = (
+        take_array(cameras, field, (views, side, side), path, where)
+        for field, side in (("intrinsics", 3), ("cam_from_world", 4))
+    )
     sizes = (torch.full((views,), side) for side in (height, width))
-    if not _are_plainly_cameras(K, E):
-        check_cameras("cameras", CameraTensors(torch.from_numpy(K), torch.from_numpy(E), *sizes))
+    check_cameras("cameras", CameraTensors(torch.from_numpy(K), torch.from_numpy(E), *sizes))
     resolutions = tuple(check_whole("voxels", "a resolution", side, 1, MAX_VOXELS) for side in voxels)
     return Metadata(
-        name=name,
-        **texts,
+        **_texts(values, path, where),  # type: ignore[arg-type]
         seed=seed,
         size=(height, width),
         depth_step=step,
         intrinsics=K,
         cam_from_world=E,
         voxels=resolutions,
-    )
-
-
-def _matrices(field: str, rows: Any, views: int, side: int) -> np.ndarray:
-    """(views, side, side) finite float64."""
-    # Lengths first: numpy would make an array of objects of ragged lists, and numbers of strings.
-    ragged = (
-        not isinstance(rows, list)
-        or len(rows) != views
-        or any(not isinstance(matrix, list) or len(matrix) != side for matrix in rows)
-        or any(not isinstance(row, list) or len(row) != side for matrix in rows for row in matrix)
-        or any(type(value) not in (float, int) for matrix in rows for row in matrix for value in row)
-    )
-    if ragged:
-        raise ValueError(f"cameras: {field} must be {views} matrices of {side} x {side} numbers, one a view")
-    array = np.array(rows, np.float64)
-    if not np.isfinite(array).all():
-        raise ValueError(f"cameras: {field} must be finite")
-    return array
-
-
-def _are_plainly_cameras(K: np.ndarray, E: np.ndarray) -> bool:
-    """Whether finite cameras are good beyond doubt; what is not, `check_cameras`, far slower, looks at."""
-    R = E[:, :3, :3]
-    return bool(
-        (K[:, 2] == (0, 0, 1)).all()
-        and (E[:, 3] == (0, 0, 0, 1)).all()
-        and (K[:, 1, 0] == 0).all()
-        and min(K[:, 0, 0].min(), K[:, 1, 1].min()) > 1e-2  # beyond 1e-6 of the largest side
-        and np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max() < 1e-4
-        and np.linalg.det(R).min() > 0.5
     )

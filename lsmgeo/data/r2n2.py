@@ -9,9 +9,9 @@ import numpy as np
 from lsmgeo.data.binvox import read_binvox
 from lsmgeo.data.files import child, parse_floats, read_text, refuse_unreadable
 from lsmgeo.data.images import image_size
-from lsmgeo.data.lsm_release import spell_synset
 from lsmgeo.data.metadata import MAX_VIEWS
 from lsmgeo.data.posed import PosedImages, assemble, make_cameras
+from lsmgeo.data.shards.shape_sources import spell_synset
 from lsmgeo.errors import DataError
 
 __all__ = ["METADATA", "is_r2n2", "read_r2n2"]

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import re
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
 from lsmgeo._checks import check_choice, check_flag, check_whole
 from lsmgeo.data.members import encode_sample
 from lsmgeo.data.metadata import MAX_SIDE, MAX_VIEWS, MAX_VOXELS
-from lsmgeo.data.shard_index import MAX_SHAPES, read_sidecar, sidecar_path
 from lsmgeo.data.shards import hash_settings, verify_shard, write_shard
-from lsmgeo.data.sources import Recipe, Source, open_source
+from lsmgeo.data.shards.shape_sources import Recipe, Source, open_source
+from lsmgeo.data.shards.shard_index import MAX_SHAPES, ShardFile, read_index, read_seal, sidecar_path
 from lsmgeo.errors import DataError, OptionError
 
 __all__ = ["Made", "make_set", "render_set"]
@@ -55,13 +55,6 @@ class _Task(NamedTuple):
     stop: int
     path: Path
     on_error: str
-
-
-class _Done(NamedTuple):
-    path: Path
-    shapes: int
-    kept: bool
-    skipped: list[tuple[str, str]]
 
 
 def render_set(
@@ -141,17 +134,7 @@ def make_set(
 ) -> Made:
     """Make the shards of any source; see `render_set`, whose options these are.
 
-    Args:
-        source: the shapes.
-        out: the folder for the shards.
-        recipe: as `Source.render` gets it.
-        per_shard: shapes in a shard.
-        jobs: worker processes.
-        on_error: "skip" or "raise".
-        overwrite: whether shards of other settings are made again.
-        progress: whether to show a bar.
-        who: what stands before an option's name in errors.
-        where: the source as the caller named it, for errors.
+    ``who`` stands before an option's name in errors, ``where`` is the source as the caller named it.
 
     Raises:
         OptionError, DataError: as `render_set`.
@@ -164,9 +147,10 @@ def make_set(
     tasks = _tasks(source, out, recipe, per_shard, on_error)
     _refuse_other_shards(out, tasks, overwrite)
     told = [_progress(task.path) for task in tasks]
+    half_written = f".{glob.escape(source.name)}-{'[0-9]' * 6}.*.tmp"
     try:
         (out / PROGRESS).mkdir(parents=True, exist_ok=True)
-        for path in told:  # a run that was killed left them
+        for path in (*told, *out.glob(half_written)):  # a run that was killed left them
             path.unlink(missing_ok=True)
     except OSError as error:
         raise DataError(out, f"cannot be written ({error})") from error
@@ -179,7 +163,7 @@ def make_set(
                 path.unlink(missing_ok=True)
             (out / PROGRESS).rmdir()
     made = Made(
-        tuple(one.path for one in done if one.shapes),
+        tuple(path for one in done for path in one.shards),
         sum(one.shapes for one in done),
         sum(one.kept for one in done),
         tuple(skip for one in done for skip in one.skipped),
@@ -224,7 +208,7 @@ def _refuse_other_shards(out: Path, tasks: list[_Task], overwrite: bool) -> None
         if overwrite and path in ours:
             continue
         try:
-            settings = read_sidecar(path).settings or ""
+            settings = read_seal(ShardFile(path)).settings
         except DataError:  # what is damaged is made again
             continue
         if not settings.startswith(recipe):
@@ -236,28 +220,29 @@ def _recipe_hash(recipe: Recipe) -> str:
     return hash_settings(recipe._asdict())[:32]
 
 
-def _run(who: str, tasks: list[_Task], jobs: int) -> list[_Done]:
+def _run(who: str, tasks: list[_Task], jobs: int) -> list[Made]:
     if jobs == 1:
         return [_make(task) for task in tasks]
     try:
         import joblib
     except ImportError as error:
         raise OptionError(f"{who}: jobs other than 1 need joblib; install lsmgeo[data]") from error
-    result: list[_Done] = joblib.Parallel(n_jobs=jobs)(joblib.delayed(_make)(task) for task in tasks)
+    result: list[Made] = joblib.Parallel(n_jobs=jobs)(joblib.delayed(_make)(task) for task in tasks)
     return result
 
 
-def _make(task: _Task) -> _Done:
+def _make(task: _Task) -> Made:
     """Make one shard, or find that it is there."""
     made_from = hash_settings({"shapes": [task.start, task.stop], "source": task.source.identity()})
     settings = f"{_recipe_hash(task.recipe)}-{made_from}"
     if verify_shard(task.path, settings):
-        there = {int(key) for key in read_sidecar(task.path).keys}
+        there = {int(key) for key in read_index(task.path).keys}
         missing = [index for index in range(task.start, task.stop) if index not in there]
         if not missing or task.on_error == "skip":
             _tell(task.path, task.stop - task.start)
             reason = "could not be used when its shard was made"
-            return _Done(task.path, len(there), True, [(task.source.file(index), reason) for index in missing])
+            left_out = tuple((task.source.file(index), reason) for index in missing)
+            return Made((task.path,), len(there), 1, left_out)
     skipped: list[tuple[str, str]] = []
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the cores are the workers', and one thread's sums have one order
@@ -267,11 +252,11 @@ def _make(task: _Task) -> _Done:
         if first is None:
             task.path.unlink(missing_ok=True)
             sidecar_path(task.path).unlink(missing_ok=True)
-            return _Done(task.path, 0, False, skipped)
+            return Made((), 0, 0, tuple(skipped))
         write_shard(task.path, chain([first], items), settings)
     finally:
         torch.set_num_threads(threads)
-    return _Done(task.path, task.stop - task.start - len(skipped), False, skipped)
+    return Made((task.path,), task.stop - task.start - len(skipped), 0, tuple(skipped))
 
 
 def _items(task: _Task, skipped: list[tuple[str, str]]) -> Iterator[tuple[int, dict[str, bytes]]]:
@@ -318,30 +303,22 @@ def _bar(told: list[Path], shapes: int, views: int, shown: bool) -> Iterator[Non
     from tqdm import tqdm
 
     finished = threading.Event()
-    total = shapes * views
-    bar: Any = tqdm(total=total, unit="view", disable=None)
-    is_log, spoke = not sys.stderr.isatty(), time.monotonic()
+    form = {} if sys.stderr.isatty() else {"bar_format": "{n} of {total} views\n", "mininterval": SECONDS_BETWEEN_LINES}
+    with tqdm(total=shapes * views, unit="view", **form) as bar:
 
-    def look() -> int:
-        done = views * sum(path.stat().st_size for path in told if path.exists())
-        bar.update(done - bar.n)
-        return done
-
-    def watch() -> None:
-        nonlocal spoke
-        while not finished.wait(SECONDS_BETWEEN_LOOKS):
+        def look() -> None:
             with contextlib.suppress(OSError):
-                done = look()
-                if is_log and time.monotonic() - spoke > SECONDS_BETWEEN_LINES:
-                    spoke = time.monotonic()
-                    print(f"{done} of {total} views", file=sys.stderr, flush=True)
+                bar.update(views * sum(path.stat().st_size for path in told if path.exists()) - bar.n)
 
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
-    try:
-        yield
-        look()
-    finally:
-        finished.set()
-        watcher.join()
-        bar.close()
+        def watch() -> None:
+            while not finished.wait(SECONDS_BETWEEN_LOOKS):
+                look()
+
+        watcher = threading.Thread(target=watch, daemon=True)
+        watcher.start()
+        try:
+            yield
+            look()
+        finally:
+            finished.set()
+            watcher.join()

@@ -14,7 +14,7 @@ from lsmgeo.cameras import CameraTensors, as_tensors
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import DTypeError, ShapeError
 
-__all__ = ["Batch", "Sample", "check_sample", "collate"]
+__all__ = ["Batch", "Sample", "check_sample", "collate", "first_views", "pad_with_first", "pad_with_zeros"]
 
 
 class Sample(NamedTuple):
@@ -205,18 +205,17 @@ def collate(samples: Sequence[Sample]) -> Batch:
                 f"collate: cameras must be of one dtype (lsmgeo.cameras.to); samples[{i}] has "
                 f"{cameras[i].intrinsics.dtype}, samples[0] {cameras[0].intrinsics.dtype}"
             )
-    counts = [len(sample.images) for sample in samples]
-    most = max(counts)
+    counts = torch.tensor([len(sample.images) for sample in samples])
     depth, mask, occupancy = (
         [tensor for sample in samples if (tensor := getattr(sample, field)) is not None]
         for field in ("depth", "mask", "occupancy")
     )
-    view_mask = torch.arange(most) < torch.tensor(counts)[:, None]
+    view_mask = torch.arange(int(counts.max())) < counts[:, None]
     return Batch(
-        _padded([sample.images for sample in samples], most),
-        CameraTensors(*(_repeated(list(fields), most) for fields in zip(*cameras, strict=True))),
-        _padded(depth, most) if depth else None,
-        _padded(mask, most) if mask else None,
+        pad_with_zeros([sample.images for sample in samples]),
+        CameraTensors(*(pad_with_first(list(fields)) for fields in zip(*cameras, strict=True))),
+        pad_with_zeros(depth) if depth else None,
+        pad_with_zeros(mask) if mask else None,
         _stacked(occupancy) if occupancy else None,
         tuple(sample.mesh for sample in samples),
         tuple(sample.category for sample in samples),
@@ -235,17 +234,21 @@ def _stacked(parts: list[Tensor]) -> Tensor:
     return default_collate(parts)
 
 
-def _padded(parts: list[Tensor], most: int) -> Tensor:
-    """(V_i, ...) tensors as one (B, most, ...), the rest 0."""
-    return _stacked([_longer(part, part.new_zeros((1, *part.shape[1:])), most) for part in parts])
+def pad_with_zeros(parts: Sequence[Tensor]) -> Tensor:
+    """(V_i, ...) tensors as one (B, V, ...), the rest 0."""
+    return _padded(parts, [part.new_zeros((1, *part.shape[1:])) for part in parts])
 
 
-def _repeated(parts: list[Tensor], most: int) -> Tensor:
-    """(V_i, ...) tensors as one (B, most, ...), the rest copies of each one's first."""
-    return _stacked([_longer(part, part[:1], most) for part in parts])
+def pad_with_first(parts: Sequence[Tensor]) -> Tensor:
+    """(V_i, ...) tensors as one (B, V, ...), the rest copies of each one's first."""
+    return _padded(parts, [part[:1] for part in parts])
 
 
-def _longer(part: Tensor, filling: Tensor, most: int) -> Tensor:
-    if len(part) == most:
-        return part
-    return torch.cat((part, filling.expand(most - len(part), *part.shape[1:])))
+def _padded(parts: Sequence[Tensor], fillings: Sequence[Tensor]) -> Tensor:
+    most = max(map(len, parts))
+    return _stacked(
+        [
+            part if len(part) == most else torch.cat((part, filling.expand(most - len(part), *part.shape[1:])))
+            for part, filling in zip(parts, fillings, strict=True)
+        ]
+    )

@@ -12,7 +12,7 @@ from PIL import Image
 
 from lsmgeo import cli, data
 from lsmgeo.data.convert_set import read_splits
-from lsmgeo.data.sources import split_by_name
+from lsmgeo.data.shards.shape_sources import split_by_name
 from lsmgeo.errors import DataError, OptionError
 from tests.data.hostile import TRIALS, judged, mutated
 from tests.data.release_writers import CENTRE, R2N2_SCALE, RADIUS, write_lsm, write_r2n2
@@ -96,7 +96,7 @@ def test_a_change_of_any_file_makes_its_shard_again(tree, tmp_path):
 
 
 def test_objects_that_cannot_be_used_are_left_out(tree, tmp_path):
-    """The file of one kills its parser; the others, read together with it, are there."""
+    """The file of one kills its parser; the others are there."""
     bad = tree / "renders" / CHAIR / "m0" / "camera_1.mat"
     content = bytearray(bad.read_bytes())
     at = content.index(b"\x09\0\0\0\x48\0\0\0")
@@ -137,7 +137,7 @@ def test_an_empty_tree_and_strange_names(tree, tmp_path):
     with pytest.raises(DataError, match="no folder"):
         data.convert_set(tmp_path / "nowhere", tmp_path / "set", jobs=1)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match="neither renders"):
+    with pytest.raises(DataError, match="holds no renders"):
         data.convert_set(tmp_path / "empty", tmp_path / "set", jobs=1)
     with pytest.raises(OptionError, match="convert_set: jobs"):
         data.convert_set(tree, tmp_path / "set", jobs=0)

@@ -21,7 +21,7 @@ import trimesh
 
 from lsmgeo import cli, scenes
 from lsmgeo.data import Recipe, ShardSet, render_set
-from lsmgeo.data.sources import split_by_name
+from lsmgeo.data.shards.shape_sources import split_by_name
 from lsmgeo.errors import DataError, OptionError
 from lsmgeo.scenes import synthetic13
 
@@ -118,7 +118,10 @@ class Bar:
     def update(self, more: int) -> None:
         self.n += more
 
-    def close(self) -> None:
+    def __enter__(self) -> Bar:
+        return self
+
+    def __exit__(self, *error: object) -> None:
         pass
 
 
@@ -129,6 +132,8 @@ def test_whole_shards_are_kept_and_damaged_ones_made_again(alone, tmp_path):
     content[5000] ^= 1
     second.write_bytes(content)
     (tmp_path / "synthetic-13-000002.json").unlink()
+    for left in ("000001.tar", "000002.json"):  # by a run that was killed
+        (tmp_path / f".synthetic-13-{left}.0a1b2c3d.tmp").write_bytes(b"half")
     times = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.tar")}
     made = render_set("synthetic-13", tmp_path, RECIPE, shapes=SHAPES, per_shard=PER_SHARD, jobs=1, progress=True)
     assert (made.kept, made.shapes, len(made.shards)) == (2, SHAPES, 4)
@@ -293,7 +298,10 @@ def test_long_work_tells_a_log_how_far_it_is(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(progress_of, "SECONDS_BETWEEN_LOOKS", 0.01)
     monkeypatch.setattr(progress_of, "SECONDS_BETWEEN_LINES", 0.02)
     render_set("synthetic-13", tmp_path, RECIPE, shapes=30, per_shard=30, jobs=1, progress=True)
-    assert " of 60 views" in capsys.readouterr().err
+    told = [int(line.split(" of 60 views")[0]) for line in capsys.readouterr().err.splitlines() if " of 60" in line]
+    assert told == sorted(told)
+    assert (told[0], told[-1]) == (0, 60)
+    assert len(told) > 3
 
 
 @pytest.mark.parametrize("voxels", ["", "8,", "many", "8;16", "[8]"])

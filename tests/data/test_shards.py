@@ -14,8 +14,9 @@ import webdataset
 from PIL import Image
 
 from lsmgeo import scenes
-from lsmgeo.data import ShardSet, encode_sample, hash_settings, shard_reading, verify_shard, write_shard
+from lsmgeo.data import ShardSet, encode_sample, hash_settings, verify_shard, write_shard
 from lsmgeo.data.images import DEPTH, RGBA, decode_png, encode_png
+from lsmgeo.data.shards import read_shards
 from lsmgeo.errors import CameraError, DataError, DTypeError, OptionError, ShapeError
 from tests.data.shapes import SETTINGS, STEP, assert_equal, make_shape, write_set
 
@@ -281,9 +282,9 @@ def test_only_what_is_asked_for_is_read(tmp_path, monkeypatch):
     names = []
     fetch = ShardSet._fetch
 
-    def listing(self, number, member):
-        names.append(member.name)
-        return fetch(self, number, member)
+    def listing(self, shard, row, suffix):
+        names.append(f"{shard.keys[row]}.{suffix}")
+        return fetch(self, shard, row, suffix)
 
     monkeypatch.setattr(ShardSet, "_fetch", listing)
     shards.read(1, views=[2], depth=False, occupancy=None)
@@ -309,7 +310,7 @@ def test_sets_go_to_other_processes(tmp_path):
 
 
 def test_few_files_are_open_at_a_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(shard_reading, "OPEN_FILES", 2)
+    monkeypatch.setattr(read_shards, "OPEN_FILES", 2)
     shapes = write_set(tmp_path, shards=5, each=1)
     shards = ShardSet(tmp_path)
     before = len(os.listdir("/proc/self/fd"))
@@ -404,6 +405,15 @@ def test_names_are_unique_in_a_set(tmp_path):
     for shard in range(2):
         write_shard(tmp_path / f"{shard}.tar", [(shard, encode_sample(SAMPLE, shard))], SETTINGS)
     with pytest.raises(DataError, match=r"two shapes are named 'shape-0', in 0.tar and 1.tar"):
+        ShardSet(tmp_path)
+    (tmp_path / "1.tar").unlink()
+    (tmp_path / "0.json").unlink()
+    with tarfile.open(tmp_path / "0.tar", "a") as tar:
+        content = encode_sample(SAMPLE, 1)["json"]
+        info = tarfile.TarInfo("00000001.json")
+        info.size = len(content)
+        tar.addfile(info, io.BytesIO(content))
+    with pytest.raises(DataError, match=r"two shapes are named 'shape-0', in 0.tar and 0.tar"):
         ShardSet(tmp_path)
 
 

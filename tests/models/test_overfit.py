@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lsmgeo.data import Batch, Recipe, collate
-from lsmgeo.data.sources import Synthetic13
+from lsmgeo.data.shards.shape_sources import Synthetic13
 from lsmgeo.metrics import voxel_iou
 from lsmgeo.models import Model, compute_loss, create
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lsmgeo.data import Recipe, collate
-from lsmgeo.data.sources import Synthetic13
+from lsmgeo.data.shards.shape_sources import Synthetic13
 from lsmgeo.metrics import voxel_iou
 from lsmgeo.models import compute_loss, create
 

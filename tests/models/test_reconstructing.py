@@ -12,7 +12,7 @@ from lsmgeo import VoxelGrid, cli, data
 from lsmgeo.cameras import CameraTensors, orbit
 from lsmgeo.classical import extract_mesh
 from lsmgeo.data import Recipe
-from lsmgeo.data.sources import Synthetic13
+from lsmgeo.data.shards.shape_sources import Synthetic13
 from lsmgeo.errors import OptionError
 from lsmgeo.models import DepthResult, VoxelResult, create, write_weights
 from lsmgeo.models.placing import frame_view, in_model_frame, place_box, place_object, spread_views

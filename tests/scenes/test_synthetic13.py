@@ -10,7 +10,7 @@ from scipy.ndimage import label
 
 from lsmgeo import scenes
 from lsmgeo.cameras import CameraTensors
-from lsmgeo.data import sources
+from lsmgeo.data.shards import shape_sources
 from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.scenes import synthetic13
 from lsmgeo.scenes.synthetic13.parameters import Parameters, random_palette
@@ -282,9 +282,9 @@ def digest(category):
 
 def test_what_a_seed_gives_belongs_to_a_version():
     digests = {category: digest(category) for category in CATEGORIES}
-    assert (sources.VERSION, digests) == (DIGESTS_OF_VERSION, DIGESTS), (
-        "What a seed gives has changed, so training sets change: raise lsmgeo.data.sources.VERSION, and put the new "
-        "version and the new digests here."
+    assert (shape_sources.VERSION, digests) == (DIGESTS_OF_VERSION, DIGESTS), (
+        "What a seed gives has changed, so training sets change: raise shape_sources.VERSION, and put the new version "
+        "and the new digests here."
     )
 
 

@@ -20,7 +20,7 @@ from lsmgeo.models.evaluation.contenders import Contender, one_size, pick
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.plots import sheet
 from lsmgeo.models.evaluation.report import Cell, Report, Row, Table, facts_of
-from lsmgeo.models.evaluation.shapes import Shapes, SizedShapes, batches
+from lsmgeo.models.evaluation.shapes import Shapes, batches
 
 __all__ = ["joint_cloud", "report_clouds"]
 
@@ -58,7 +58,7 @@ def report_clouds(contenders: Sequence[Contender], shapes: Shapes, options: Opti
         raise OptionError("evaluate: report 'clouds' needs two views at least, which plane sweep matches")
     pictures, clouds, measured = {}, {}, []
     methods = (SWEEP, *(contender.name for contender in contenders))
-    for batch in batches(SizedShapes(shapes, size), most, 1, resolution=None, depth=True, progress=options.progress):
+    for batch in batches(shapes.at(size), most, 1, resolution=None, depth=True, progress=options.progress):
         shape = batch.name[0]
         found = {
             (name, count): depth

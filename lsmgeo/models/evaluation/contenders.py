@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from lsmgeo.cameras import to
 from lsmgeo.cameras.tensors import CameraTensors
+from lsmgeo.data.shards.shape_transforms import resize_views
 from lsmgeo.errors import OptionError
-from lsmgeo.models.evaluation.shapes import resized
 from lsmgeo.scenes.synthetic13 import CLASS_SPLITS
 
 __all__ = ["Contender", "Training", "one_resolution", "one_size", "open_contenders", "pick"]
@@ -119,7 +119,7 @@ class Contender:
         return found.float().cpu()
 
     def _run(self, images: Tensor, cameras: CameraTensors, **options: Any) -> Any:
-        images, cameras = resized(images, cameras, self.size)
+        images, cameras = resize_views(images, cameras, self.size)
         device = next(self.model.parameters(), torch.zeros(())).device
         return self.model.run(images.to(device), to(cameras, device), **options)  # type: ignore[operator]
 

@@ -19,7 +19,7 @@ from lsmgeo.models.evaluation.paper import DEPTH, paper_categories
 from lsmgeo.models.evaluation.plots import sheet
 from lsmgeo.models.evaluation.report import Cell, Report, Row, Table, facts_of
 from lsmgeo.models.evaluation.scores import Scores, joined
-from lsmgeo.models.evaluation.shapes import Shapes, SizedShapes, batches
+from lsmgeo.models.evaluation.shapes import Shapes, batches
 
 __all__ = ["report_depth"]
 
@@ -57,8 +57,7 @@ def report_depth(contenders: Sequence[Contender], shapes: Shapes, options: Optio
         raise OptionError("evaluate: report 'depth' needs two views at least, which plane sweep matches")
     scores = {name: Scores() for name in (SWEEP, *(contender.name for contender in contenders))}
     rows_drawn: dict[str, list[Picture | None]] = {}
-    sized = SizedShapes(shapes, size)
-    for batch in batches(sized, views, options.batch, resolution=None, depth=True, progress=options.progress):
+    for batch in batches(shapes.at(size), views, options.batch, resolution=None, depth=True, progress=options.progress):
         assert batch.depth is not None
         assert batch.mask is not None
         sweeps = [

@@ -6,10 +6,12 @@ What a sample is depends on (seed, epoch, index) alone, never on workers or on w
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import warnings
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,16 +19,16 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset
 
 from lsmgeo.data import Batch, EpochSampler, ShapeDataset, ShardSet, collate
+from lsmgeo.data.shards.shape_sets import ShapeSet, SyntheticSet, render_batch, synthetic_numbers
+from lsmgeo.data.shards.shape_transforms import AdaptedShapes
 from lsmgeo.errors import OptionError
-from lsmgeo.models.training.adapting import AdaptedShapes
 from lsmgeo.models.training.config import DataConfig
 from lsmgeo.models.training.launch import ignore_stop
-from lsmgeo.models.training.synthetic_shapes import Renderer, SyntheticShapes
 
-__all__ = ["Need", "ShapeStream", "Shapes", "open_shapes", "training_batches", "validation_batches"]
+__all__ = ["Need", "Shapes", "endless_order", "open_shapes", "training_batches", "validation_batches"]
 
 
 class Need(NamedTuple):
@@ -88,41 +90,47 @@ def open_shapes(
     else:
         split = config.validation_split
         categories = config.categories if config.validation_categories is None else config.validation_categories
-    number = config.views if views is None else views
     names = categories_of(categories)
-    noise = config.pose_noise if is_training else 0.0
+    found: ShapeSet
+    part: dict[str, Any]
     if config.source == "synthetic-13":
-        rendered = SyntheticShapes(
-            config,
-            size=need.image_size,
-            voxels=need.voxels,
-            seed=seed,
-            views=number if isinstance(number, tuple) else (number, number),
-            split=split,
-            categories=names,
-            noise=noise,
-        )
-        on_device = device.type != "cpu"
-        return Shapes(rendered, Renderer(need.depth, device, on_device), _identity(rendered.names), on_device)
-    shards = ShardSet(config.source)
-    _check_content(shards, need)
-    dataset: Dataset[Any] = ShapeDataset(
-        shards,
-        views=number,
+        found, part = _synthetic(config, need, split, names), {}
+    else:
+        found, part = ShardSet(config.source), {"categories": names, "split": split}
+        _check_content(found, need)
+    dataset = ShapeDataset(
+        found,
+        views=config.views if views is None else views,
         seed=seed,
         depth=need.depth,
         occupancy=need.voxels,
         background=config.background,
-        categories=names,
-        split=split,
         on_error=config.on_error if is_training else "raise",
         max_bad_fraction=config.max_bad_fraction,
         bad_samples=None if folder is None else folder / "bad_samples.jsonl",
+        **part,
     )
-    all_names = dataset.names  # type: ignore[attr-defined]
-    limit = len(all_names) if config.limit is None else config.limit
-    adapted = AdaptedShapes(dataset, need.image_size, noise, seed, min(limit, len(all_names)))
-    return Shapes(adapted, collate, _identity(all_names[:limit]))
+    length = len(dataset) if config.limit is None else min(config.limit, len(dataset))
+    noise = config.pose_noise if is_training else 0.0
+    adapted = AdaptedShapes(dataset, need.image_size, noise, seed, length)
+    if isinstance(found, SyntheticSet):
+        on_device = device.type != "cpu"
+        render = partial(render_batch, depth=need.depth, device=device, at_once=on_device)
+        told = [f"{found.seed}/{found.pool}/{number}" for number in found.numbers]
+        return Shapes(adapted, render, _identity(told), on_device)
+    return Shapes(adapted, collate, _identity(dataset.names[:length]))
+
+
+def _synthetic(config: DataConfig, need: Need, split: str, categories: Sequence[str] | None) -> SyntheticSet:
+    """The shapes of one part of a finite set, which are described here and rendered as batches."""
+    endless = synthetic_numbers(split, categories, config.set_seed)
+    below = itertools.takewhile(lambda number: number < config.shapes, endless)
+    numbers = list(itertools.islice(below, config.limit))
+    if not numbers:
+        raise OptionError(
+            f"data: of {config.shapes} shapes of synthetic-13 none is of split {split!r}, categories {categories}"
+        )
+    return SyntheticSet(numbers, need.image_size, config.set_seed, config.pool, is_rendered=False)
 
 
 def categories_of(wanted: str | Sequence[str]) -> tuple[str, ...] | None:
@@ -162,7 +170,9 @@ def _identity(names: Sequence[str]) -> str:
     return hashlib.sha256(json.dumps(list(names)).encode()).hexdigest()[:16]
 
 
-class ShapeStream(Sampler[list[tuple[int, int]]]):
+def endless_order(
+    length: int, *, seed: int, start: int, batch: int, rank: int = 0, processes: int = 1
+) -> Iterator[list[tuple[int, int]]]:
     """The batches of one process of a run, without end, from any sample on: epoch after epoch, each in an own order.
 
     A batch may hold the end of one epoch and the start of the next, so that every step takes equally many shapes.
@@ -176,27 +186,20 @@ class ShapeStream(Sampler[list[tuple[int, int]]]):
         processes: of how many.
 
     Example:
-        >>> stream = iter(ShapeStream(3, seed=0, start=0, batch=2, rank=1, processes=2))
+        >>> stream = endless_order(3, seed=0, start=0, batch=2, rank=1, processes=2)
         >>> [epoch for epoch, _ in next(stream)], [epoch for epoch, _ in next(stream)]
         ([0, 1], [1, 2])
     """
-
-    def __init__(self, length: int, *, seed: int, start: int, batch: int, rank: int = 0, processes: int = 1) -> None:
-        self.sampler = EpochSampler(length, seed=seed)
-        self.start, self.batch, self.rank, self.processes = start, batch, rank, processes
-
-    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        length, place = self.sampler.length, self.start + self.rank
-        epoch, order = -1, np.empty(0, np.int64)
-        while True:
-            items = []
-            for _ in range(self.batch):
-                if place // length != epoch:
-                    epoch = place // length
-                    order = self.sampler.order(epoch)
-                items.append((epoch, int(order[place % length])))
-                place += self.processes
-            yield items
+    sampler = EpochSampler(length, seed=seed)
+    epoch, order = -1, np.empty(0, np.int64)
+    for first in itertools.count(start + rank, batch * processes):
+        items = []
+        for place in range(first, first + batch * processes, processes):
+            if place // length != epoch:
+                epoch = place // length
+                order = sampler.order(epoch)
+            items.append((epoch, int(order[place % length])))
+        yield items
 
 
 def training_batches(
@@ -214,8 +217,8 @@ def training_batches(
         rank: which process this is.
         processes: of how many.
     """
-    stream = ShapeStream(len(shapes), seed=seed, start=start, batch=batch, rank=rank, processes=processes)
-    return _batches(shapes, stream, workers, device)
+    order = endless_order(len(shapes), seed=seed, start=start, batch=batch, rank=rank, processes=processes)
+    return _batches(shapes, order, workers, device)
 
 
 def validation_batches(
@@ -246,10 +249,10 @@ def validation_batches(
     return _batches(shapes, chunks, workers, device)
 
 
-def _batches(shapes: Shapes, batches: Any, workers: int, device: torch.device) -> Generator[Batch, None, None]:
+def _batches(shapes: Shapes, order: Iterable[Any], workers: int, device: torch.device) -> Generator[Batch, None, None]:
     loader = DataLoader(
         shapes.dataset,
-        batch_sampler=batches,
+        batch_sampler=order,
         num_workers=workers,
         collate_fn=list if shapes.on_device else shapes.collate,
         worker_init_fn=ignore_stop,

@@ -40,6 +40,10 @@ class FakeShapes:
     def __len__(self):
         return len(self.widths)
 
+    def at(self, size):
+        assert size == SIZE
+        return self
+
     def read(self, index, views, *, resolution, depth, background):
         images = torch.stack([torch.full((3, SIZE, SIZE), (view + 1) / 20) for view in range(views)])
         images[:, :, 0, 0] = 1.0 if background == "white" else 0.5

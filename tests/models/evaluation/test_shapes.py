@@ -7,9 +7,10 @@ import torch
 from lsmgeo.cameras import stack
 from lsmgeo.data import Recipe, ShardSet, render_set
 from lsmgeo.data.sample import first_views
+from lsmgeo.data.shards.shape_transforms import resize_views
 from lsmgeo.errors import DataError, OptionError
 from lsmgeo.models.evaluation import open_shapes
-from lsmgeo.models.evaluation.shapes import SizedShapes, batches, noise_of, resized
+from lsmgeo.models.evaluation.shapes import batches, noise_of
 from lsmgeo.scenes import synthetic13
 
 READ = {"resolution": 16, "depth": True, "background": "white"}
@@ -52,8 +53,8 @@ def test_the_first_views_do_not_depend_on_their_number_and_follow_from_the_seed(
 def test_only_test_shapes_are_taken_in_turn_of_the_categories():
     shapes = open_shapes(None, size=16, shapes=20)
     assert shapes.categories == [*synthetic13.CATEGORIES, *tuple(synthetic13.CATEGORIES)[:7]]
-    assert {synthetic13.split(0, index) for index in shapes.indices} == {"test"}
-    assert open_shapes(None, size=16, shapes=30).indices[:20] == shapes.indices
+    assert {synthetic13.split(0, index) for index in shapes.source.numbers} == {"test"}
+    assert open_shapes(None, size=16, shapes=30).source.numbers[:20] == shapes.source.numbers
     some = open_shapes(None, size=16, shapes=4, categories=("lamp", "car"))
     assert some.categories == ["car", "lamp", "car", "lamp"]
 
@@ -67,6 +68,8 @@ def test_shards_are_filtered_by_split_and_told_when_nothing_is_left(folder):
         open_shapes(folder, size=24, categories=("boat",))
     with pytest.raises(DataError):
         open_shapes(folder / "nowhere", size=24)
+    with pytest.raises(OptionError, match="split must be one of 'train', 'val', 'test'; got str 'tset'"):
+        open_shapes(None, size=24, split="tset")
     with pytest.raises(OptionError, match="shapes"):
         open_shapes(None, size=24, shapes=0)
 
@@ -74,15 +77,15 @@ def test_shards_are_filtered_by_split_and_told_when_nothing_is_left(folder):
 def test_batches_hold_all_shapes_once(folder):
     shapes = open_shapes(folder, size=24, split="train")
     names = [name for batch in batches(shapes, 2, 2, resolution=None) for name in batch.name]
-    assert sorted(names) == sorted(shapes.shards.names[index] for index in shapes.indices)
+    assert sorted(names) == sorted(shapes.source.names[index] for index in shapes.indices)
 
 
 def test_other_sizes_keep_the_camera_s_view(folder):
     sample = open_shapes(folder, size=24).read(0, 2, **READ)
-    images, cameras = resized(sample.images[None], stack([sample.cameras]), 12)
+    images, cameras = resize_views(sample.images[None], stack([sample.cameras]), 12)
     torch.testing.assert_close(images[0, :, :, 3, 4], sample.images[:, :, 6:8, 8:10].mean((-2, -1)))
     torch.testing.assert_close(cameras.intrinsics[0, :, 0, 0], sample.cameras.intrinsics[:, 0, 0] / 2)
-    sized = SizedShapes(open_shapes(folder, size=24), 12).read(0, 2, **READ)
+    sized = open_shapes(folder, size=24).at(12).read(0, 2, **READ)
     torch.testing.assert_close(sized.images, images[0])
     assert sized.depth.shape == (2, 12, 12)
     assert tuple(first_views(cameras, 1).intrinsics.shape) == (1, 1, 3, 3)

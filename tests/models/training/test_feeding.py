@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 
 import numpy as np
@@ -13,13 +14,13 @@ import torch
 from lsmgeo import cameras as camera_tools
 from lsmgeo import scenes
 from lsmgeo.data import Recipe, Sample, ShardSet, render_set
+from lsmgeo.data.shards.shape_transforms import resize_sample
 from lsmgeo.errors import DataError, OptionError
-from lsmgeo.models.training.adapting import resize_sample
 from lsmgeo.models.training.config import DataConfig
 from lsmgeo.models.training.feeding import (
     Need,
-    ShapeStream,
     categories_of,
+    endless_order,
     open_shapes,
     training_batches,
     validation_batches,
@@ -81,8 +82,8 @@ def test_workers_render_the_same():
 def test_rendering_all_views_at_once_is_the_same(workers):
     """What a GPU does, on the CPU: scenes come from the workers, shapes have two or three lights, views are ragged."""
     one_by_one = opened(SYNTHETIC, Need(32, 16, True))
-    renderer = dataclasses.replace(one_by_one.collate, at_once=True)
-    at_once = dataclasses.replace(one_by_one, collate=renderer, on_device=True)
+    render = functools.partial(one_by_one.collate, at_once=True)
+    at_once = dataclasses.replace(one_by_one, collate=render, on_device=True)
     for found, expected in zip(batches(at_once, 2, workers=workers), batches(one_by_one, 2), strict=True):
         assert not expected.view_mask.all()
         assert_equal(found, expected)
@@ -110,7 +111,7 @@ def test_processes_share_a_step(stored):
 
 
 def test_a_stream_never_ends_and_every_epoch_has_its_own_order():
-    stream = iter(ShapeStream(5, seed=1, start=3, batch=4))
+    stream = endless_order(5, seed=1, start=3, batch=4)
     items = list(itertools.chain.from_iterable(itertools.islice(stream, 6)))
     assert [epoch for epoch, _ in items] == [0] * 2 + [1] * 5 + [2] * 5 + [3] * 5 + [4] * 5 + [5] * 2
     orders = [[index for epoch, index in items if epoch == number] for number in (1, 2, 3, 4)]

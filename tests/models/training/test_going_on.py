@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from lsmgeo.data import ShardSet
+from lsmgeo.data.shards.shape_transforms import resize_sample, resize_views
 from lsmgeo.errors import OptionError
 from lsmgeo.models import create, write_weights
 from lsmgeo.models.training import TrainingConfig, train
@@ -80,11 +81,8 @@ def test_one_view_is_not_drawn_for_shapes_that_have_differently_many(shards):
 
 
 def test_pictures_grow_in_evaluation_as_in_training(shards):
-    from lsmgeo.models.evaluation.shapes import resized
-    from lsmgeo.models.training.adapting import resize_sample
-
     sample = ShardSet(shards).read(0, depth=False, occupancy=None)
-    images, _ = resized(sample.images[None], type(sample.cameras)(*(item[None] for item in sample.cameras)), 48)
+    images, _ = resize_views(sample.images[None], type(sample.cameras)(*(item[None] for item in sample.cameras)), 48)
     torch.testing.assert_close(images[0], resize_sample(sample, 48).images, rtol=0, atol=0)
     # Interpolated, not repeated: every second pixel of a row of a repeated picture equals its neighbour.
     assert not torch.equal(images[0, ..., 0], images[0, ..., 1])

@@ -1,13 +1,12 @@
-"""Writing shards: tar files in WebDataset naming, each with an index beside it.
+"""Writing shards: tar files in WebDataset naming, each with a sidecar that seals it.
 
 ``NAME-000000.tar`` holds the members of some hundreds of shapes (see `lsmgeo.data.members`); ``NAME-000000.json``, its
-sidecar, says where each begins, how long it is and what its check sum is, so that one shape can be read without the
-others. The tar is written first and the sidecar after it, both atomically: a tar whose sidecar fits is whole.
+sidecar, holds the SHA-256 of the tar, the check sums of its members and the hash of the settings that it was made with.
+The tar is written first and the sidecar after it, both atomically: a tar whose sidecar fits is whole.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
@@ -17,16 +16,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lsmgeo._checks import describe
-from lsmgeo.data.files import atomic_file
+from lsmgeo.data.files import atomic_file, write_atomic
 from lsmgeo.data.members import SUFFIX, format_key
 from lsmgeo.data.metadata import decode_metadata
-from lsmgeo.data.shard_index import (
+from lsmgeo.data.shards.shard_index import (
     BLOCK,
     MAX_MEMBER_BYTES,
     MAX_MEMBERS,
     MAX_SHAPES,
-    MAX_SIDECAR_BYTES,
-    read_sidecar,
+    ShardFile,
+    read_seal,
     seal,
     sidecar_path,
 )
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from lsmgeo.data.files import AtomicFile
-    from lsmgeo.data.metadata import Metadata
 
 __all__ = ["hash_settings", "verify_shard", "write_shard"]
 
@@ -73,8 +71,7 @@ def write_shard(
     moment, even by the loss of power, it leaves either no new shard or a whole one; the sidecar comes last. Only one
     process may write a shard at a time.
 
-    A shard holds 10,000 shapes, 1,000,000 members, each of 64 MiB, and has an index of 16 MiB at most; what has more is
-    cut into several.
+    A shard holds 10,000 shapes and 1,000,000 members, each of 64 MiB, at most; what has more is cut into several.
 
     Args:
         path: the tar file to write, ``NAME-000000.tar``.
@@ -106,24 +103,17 @@ def write_shard(
     if not isinstance(settings_hash, str) or not settings_hash.isprintable() or not 0 < len(settings_hash) <= 128:
         raise OptionError(f"write_shard: settings_hash must be 1 to 128 characters; got {describe(settings_hash)}")
     sidecar = sidecar_path(path)
-    for file in (path, sidecar):
-        _remove_leftovers(file)
-    entries = _Entries(path)
     with atomic_file(path) as stream:
-        _lock(stream)
-        writer = _TarWriter(stream)
+        tar = _TarWriter(path, stream)
         for key, members in items:
-            entries.write(writer, format_key(key), members)
-        writer.finish()
-        index = entries.sidecar(writer, settings_hash)
+            tar.add(format_key(key), members)
+        content = tar.finish(settings_hash)
         # From here to the end the shard has no sidecar rather than one that tells of other content.
         try:
             sidecar.unlink(missing_ok=True)
         except OSError as error:
             raise DataError(sidecar, f"cannot be replaced ({error})") from error
-    with atomic_file(sidecar) as stream:
-        _lock(stream)
-        stream.write(index)
+    write_atomic(sidecar, content)
     return path
 
 
@@ -139,73 +129,42 @@ def verify_shard(path: str | os.PathLike[str], settings_hash: str) -> bool:
     """
     path = Path(path)
     try:
-        index = read_sidecar(path)
-        if index.settings != settings_hash:
+        found = read_seal(ShardFile(path))
+        if found.settings != settings_hash:
             return False
         with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest() == index.sha256
+            return hashlib.file_digest(stream, "sha256").hexdigest() == found.sha256
     except OSError:  # a DataError is one
         return False
 
 
 class _TarWriter:
-    """A tar file whose headers hold nothing but names and sizes."""
+    """A tar file whose headers hold nothing but names and sizes; refuses what a reader would refuse."""
 
-    def __init__(self, stream: AtomicFile) -> None:
-        self.offset = 0
-        self.digest = hashlib.sha256()
-        self._stream = stream
+    def __init__(self, path: Path, stream: AtomicFile) -> None:
+        self._path, self._stream = path, stream
+        self._digest, self._bytes = hashlib.sha256(), 0
+        self._keys: set[str] = set()
+        self._names: set[str] = set()
+        self._crc32: list[int] = []
 
     def _write(self, content: bytes) -> None:
         self._stream.write(content)
-        self.digest.update(content)
-        self.offset += len(content)
+        self._digest.update(content)
+        self._bytes += len(content)
 
-    def add(self, name: str, content: bytes) -> int:
-        """Append a file; returns where its content begins."""
-        info = tarfile.TarInfo(name)  # mode 0644, owner 0, time 0
-        info.size = len(content)
-        self._write(info.tobuf(tarfile.USTAR_FORMAT))
-        begin = self.offset
-        self._write(content)
-        self._write(bytes(-len(content) % BLOCK))
-        return begin
+    def add(self, key: str, members: Mapping[str, bytes]) -> None:
+        """Append the members of a shape."""
+        self._check(key, members)
+        for suffix, content in members.items():
+            info = tarfile.TarInfo(f"{key}.{suffix}")  # mode 0644, owner 0, time 0
+            info.size = len(content)
+            self._write(info.tobuf(tarfile.USTAR_FORMAT))
+            self._write(content)
+            self._write(bytes(-len(content) % BLOCK))
+            self._crc32.append(zlib.crc32(content))
 
-    def finish(self) -> None:
-        """End the tar: two empty blocks, and more up to a full record, as tar programs expect."""
-        self._write(bytes(2 * BLOCK))
-        self._write(bytes(-self.offset % tarfile.RECORDSIZE))
-
-
-class _Entries:
-    """What the sidecar will say of the shapes, as they are written; refuses what `read_sidecar` would refuse."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._keys: set[str] = set()
-        self._names: set[str] = set()
-        self._layouts: dict[tuple[str, ...], int] = {}
-        self._texts: list[str] = []
-        self._members = self._length = 0
-
-    def write(self, writer: _TarWriter, key: str, members: Mapping[str, bytes]) -> None:
-        """Write the members of a shape, and note its entry."""
-        metadata = self._checked(key, members)
-        entry = {
-            "key": key,
-            "name": metadata.name,
-            "category": metadata.category,
-            "split": metadata.split,
-            "layout": self._layouts.setdefault(tuple(members), len(self._layouts)),
-            "offsets": [writer.add(f"{key}.{suffix}", content) for suffix, content in members.items()],
-            "sizes": [len(content) for content in members.values()],
-            "crc32": [zlib.crc32(content) for content in members.values()],
-        }
-        self._texts.append(_dumps(entry))
-        self._check_length(len(self._texts[-1]) + 1)
-
-    def _checked(self, key: str, members: Mapping[str, bytes]) -> Metadata:
-        """What the json of a shape says, after a look at all that can be told before it is written."""
+    def _check(self, key: str, members: Mapping[str, bytes]) -> None:
         strange = [suffix for suffix in members if not SUFFIX.fullmatch(suffix)]
         if strange or next(iter(members), None) != "json":
             raise self._refusal(
@@ -222,60 +181,28 @@ class _Entries:
             seen.add(value)
         if len(self._keys) > MAX_SHAPES:
             raise self._refusal(f"more than {MAX_SHAPES} shapes; write several shards")
-        self._members += len(members)
-        if self._members > MAX_MEMBERS:
+        if len(self._crc32) + len(members) > MAX_MEMBERS:
             raise self._refusal(f"more than {MAX_MEMBERS} members; write several shards")
         for suffix, content in members.items():
             if len(content) > MAX_MEMBER_BYTES:
                 raise self._refusal(f"{key}.{suffix} has {len(content)} bytes, {MAX_MEMBER_BYTES} are the limit")
-        return metadata
 
-    def _check_length(self, more: int) -> None:
-        self._length += more
-        if self._length > MAX_SIDECAR_BYTES:
-            raise self._refusal(f"its index is longer than {MAX_SIDECAR_BYTES} bytes; write several shards")
-
-    def sidecar(self, writer: _TarWriter, settings_hash: str) -> bytes:
-        """The content of the sidecar of a tar that is finished."""
-        if not self._texts:
+    def finish(self, settings_hash: str) -> bytes:
+        """End the tar: two empty blocks, and more up to a full record, as tar programs expect. Returns its sidecar."""
+        if not self._keys:
             raise self._refusal("there is no shape to write")
-        head = {
+        self._write(bytes(2 * BLOCK))
+        self._write(bytes(-self._bytes % tarfile.RECORDSIZE))
+        values = {
             "format": "lsmgeo shard index",
-            "version": 1,
+            "version": 2,
             "tar": self._path.name,
-            "bytes": writer.offset,
-            "sha256": writer.digest.hexdigest(),
+            "bytes": self._bytes,
+            "sha256": self._digest.hexdigest(),
             "settings": settings_hash,
-            "shapes": len(self._texts),
-            "layouts": [list(layout) for layout in self._layouts],
+            "crc32": self._crc32,
         }
-        content = seal(f'{_dumps(head)[:-1]},"entries":[{",".join(self._texts)}]}}\n'.encode())
-        self._check_length(len(content) - self._length)
-        return content
+        return seal(json.dumps(values, separators=(",", ":")).encode() + b"\n")
 
     def _refusal(self, reason: str) -> OptionError:
         return OptionError(f"write_shard: {self._path}: {reason}")
-
-
-def _dumps(value: dict[str, Any]) -> str:
-    return json.dumps(value, separators=(",", ":"))
-
-
-def _lock(stream: AtomicFile) -> None:
-    """Mark a temporary file as being written, until this process ends, however it does."""
-    with contextlib.suppress(ImportError, OSError):  # no locks on this system, or on this file system
-        import fcntl
-
-        fcntl.flock(stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def _remove_leftovers(path: Path) -> None:
-    """Remove what killed processes left of this file: temporary files that nobody holds locked."""
-    try:
-        import fcntl
-    except ImportError:
-        return
-    for leftover in path.parent.glob(f".{path.name}.*.tmp"):
-        with contextlib.suppress(OSError), leftover.open("rb") as stream:
-            fcntl.flock(stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-            leftover.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""What happens to a sample of shards before a model sees it: another size of images, noise in its poses."""
+"""What happens to a shape before a model sees it: another size of images, noise in its poses."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from torch.utils.data import Dataset
 
 from lsmgeo import cameras as camera_tools
 from lsmgeo.cameras import CameraTensors
-from lsmgeo.data import Sample
+from lsmgeo.data.sample import Sample
+from lsmgeo.data.shards.shape_sets import ShapeSpec
 
-__all__ = ["AdaptedShapes", "resize_images", "resize_sample", "turn_cameras"]
+__all__ = ["AdaptedShapes", "resize_sample", "resize_views", "turn_cameras"]
 
 # The last number of the seed that pose noise is drawn from, unlike any number of another draw.
 NOISE = 0x706F7365
 
 
-class AdaptedShapes(Dataset[Sample]):
-    """Samples of shards at the size of the model's images, their cameras turned a little where noise is asked for."""
+class AdaptedShapes(Dataset[Sample | ShapeSpec]):
+    """The first shapes of a data set at the size of the model's images, the cameras that it is told turned by noise."""
 
     def __init__(self, dataset: Dataset[Any], size: int, noise: float, seed: int, length: int) -> None:
         self.dataset, self.size, self.noise, self.seed, self.length = dataset, size, noise, seed, length
@@ -28,9 +29,12 @@ class AdaptedShapes(Dataset[Sample]):
     def __len__(self) -> int:
         return self.length
 
-    def __getitem__(self, item: tuple[int, int]) -> Sample:
-        sample = resize_sample(self.dataset[item], self.size)
-        return sample._replace(cameras=turn_cameras(sample.cameras, self.noise, self.seed, *item))
+    def __getitem__(self, item: tuple[int, int]) -> Sample | ShapeSpec:
+        shape = self.dataset[item]
+        if isinstance(shape, ShapeSpec):
+            return shape._replace(told=turn_cameras(shape.cameras, self.noise, self.seed, *item))
+        shape = resize_sample(shape, self.size)
+        return shape._replace(cameras=turn_cameras(shape.cameras, self.noise, self.seed, *item))
 
 
 def turn_cameras(cameras: CameraTensors, degrees: float, seed: int, epoch: int, index: int) -> CameraTensors:
@@ -70,17 +74,28 @@ def resize_sample(sample: Sample, size: int) -> Sample:
         share = _averaged(mask.float(), size)
         if depth is not None:
             depth = torch.where(share >= 0.5, _averaged(depth * mask, size) / share.clamp_min(1e-6), 0.0)
+    images, cameras = resize_views(sample.images, sample.cameras, size)
     return sample._replace(
-        images=resize_images(sample.images, size),
-        cameras=camera_tools.resize(sample.cameras, size, size),
+        images=images,
+        cameras=cameras,
         depth=depth,
         mask=None if sample.mask is None or share is None else share >= 0.5,
     )
 
 
-def resize_images(images: Tensor, size: int) -> Tensor:
-    """Square images (N, C, size, size) of others: smaller ones hold means of areas, larger ones are interpolated."""
-    return torch.nn.functional.interpolate(images, (size, size), mode="area" if size < images.shape[-1] else "bilinear")
+def resize_views(images: Tensor, cameras: CameraTensors, size: int) -> tuple[Tensor, CameraTensors]:
+    """Square pictures of another size, and their cameras: smaller ones hold means of areas, larger are interpolated.
+
+    Args:
+        images: (..., 3, H, W) of any size.
+        cameras: of the same leading shape.
+        size: height and width in pixels.
+    """
+    if tuple(images.shape[-2:]) == (size, size):
+        return images, cameras
+    mode = "area" if size < images.shape[-1] else "bilinear"
+    resized = torch.nn.functional.interpolate(images.flatten(0, -4), (size, size), mode=mode)
+    return resized.unflatten(0, images.shape[:-3]), camera_tools.resize(cameras, size, size)
 
 
 def _averaged(maps: Tensor, size: int) -> Tensor:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import stat
-import zlib
 from bisect import bisect_right
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,14 +14,12 @@ import torch
 from lsmgeo._checks import check_flag, describe, is_whole
 from lsmgeo.data.backgrounds import Background, BackgroundError, make_background
 from lsmgeo.data.files import child
-from lsmgeo.data.members import decode_depth, decode_occupancy, decode_picture
+from lsmgeo.data.images import DEPTH, RGBA, PngKind, decode_png
+from lsmgeo.data.members import decode_occupancy
 from lsmgeo.data.metadata import Metadata, decode_metadata
 from lsmgeo.data.sample import Sample
-from lsmgeo.data.shard_index import BLOCK, ShardIndex, open_index
+from lsmgeo.data.shards.shard_index import ShardFile, ShardIndex, read_index
 from lsmgeo.errors import DataError, OptionError
-
-if TYPE_CHECKING:
-    from lsmgeo.data.shard_index import Member
 
 __all__ = ["ShardSet"]
 
@@ -35,15 +31,15 @@ MAX_PIXELS_AT_ONCE = 1 << 28
 class ShardSet:
     """The shapes of all shards (``*.tar``) of a folder, in the order of their names.
 
-    The indices are read once, at opening; a shard without a sidecar is indexed from its tar's headers. Files are opened
-    when they are first read and at no common position, so the set may be used from several threads, and in processes
-    forked from this one or sent it by pickle.
+    The headers of the tars, and the check sums of the sidecars that are there, are read once, at opening. Files are
+    opened when they are first read and at no common position, so the set may be used from several threads, and in
+    processes forked from this one or sent it by pickle.
 
     Args:
         folder: where the shards lie.
 
     Raises:
-        DataError: no such folder, no shard in it, a damaged index, or a name that two shapes have.
+        DataError: no such folder, no shard in it, a damaged one, or a name that two shapes have.
 
     Attributes:
         folder: as given.
@@ -74,13 +70,13 @@ class ShardSet:
             raise DataError(folder, f"cannot be read ({error})") from error
         if not names:
             raise DataError(folder, "holds no shard (*.tar)")
-        self._shards = [open_index(child(self.folder, name, self.folder)) for name in names]
+        self._shards = [read_index(child(self.folder, name, self.folder)) for name in names]
         self._ends = np.cumsum([len(shard) for shard in self._shards]).tolist()
         self.names = [name for shard in self._shards for name in shard.names]
         self.categories = [category for shard in self._shards for category in shard.categories]
         self.splits = [split for shard in self._shards for split in shard.splits]
         self.view_counts = np.concatenate([shard.view_counts() for shard in self._shards])
-        self._handles: dict[int, _Handle] = {}
+        self._open: dict[Path, ShardFile] = {}
         if len(set(self.names)) != len(self.names):
             seen: set[str] = set()
             name = next(name for name in self.names if name in seen or seen.add(name))  # type: ignore[func-returns-value]
@@ -94,18 +90,18 @@ class ShardSet:
         return len(self.names)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_handles": {}}
+        return {**self.__dict__, "_open": {}}
 
-    def _locate(self, index: int) -> tuple[int, int]:
-        """The number of a shape's shard, and its row in that."""
+    def _locate(self, index: int) -> tuple[ShardIndex, int]:
+        """The shard of a shape, and its row in that."""
         if not is_whole(index) or not 0 <= index < len(self):
             raise OptionError(f"ShardSet: index must be an integer from 0 to {len(self) - 1}; got {describe(index)}")
         number = bisect_right(self._ends, int(index))
-        return number, int(index) - (self._ends[number - 1] if number else 0)
+        return self._shards[number], int(index) - (self._ends[number - 1] if number else 0)
 
     def path(self, index: int) -> Path:
         """The tar file that holds a shape."""
-        return self._shards[self._locate(index)[0]].path
+        return self._locate(index)[0].path
 
     def metadata(self, index: int) -> Metadata:
         """What the json of a shape says.
@@ -114,14 +110,10 @@ class ShardSet:
             OptionError: no such shape.
             DataError: it is damaged.
         """
-        number, row = self._locate(index)
-        shard = self._shards[number]
-        content = self._fetch(number, shard.member(row, "json"))
-        metadata = decode_metadata(content, shard.keys[row], shard.path)
-        for field, indexed in (("name", shard.names), ("category", shard.categories), ("split", shard.splits)):
-            if getattr(metadata, field) != indexed[row]:
-                reason = f"{field} is {getattr(metadata, field)!r:.80}, in the index {indexed[row]!r:.80}"
-                raise DataError(shard.path, f"{shard.keys[row]}.json: {reason}")
+        shard, row = self._locate(index)
+        metadata = decode_metadata(self._fetch(shard, row, "json"), shard.keys[row], shard.path)
+        if metadata.name != shard.names[row]:
+            raise DataError(shard.path, f"{shard.keys[row]}.json has changed since it was opened")
         if len(metadata.intrinsics) != self.view_counts[index]:
             reason = f"tells of {len(metadata.intrinsics)} views, the shard holds {self.view_counts[index]}"
             raise DataError(shard.path, f"{shard.keys[row]}.json: {reason}")
@@ -156,21 +148,19 @@ class ShardSet:
             DataError: what is asked for is not in the shard, it is damaged, it is more than 2^28 pixels at once (views
                 times height times width), or a picture of the folder of backgrounds cannot be used.
         """
-        number, row = self._locate(index)
-        metadata = self.metadata(index)
+        shard, row = self._locate(index)
+        key, metadata = shard.keys[row], self.metadata(index)
         source = make_background(background)
-        if source.is_random and generator is None:
-            raise OptionError("ShardSet.read: a random background needs a generator")
         chosen = _views(views, int(self.view_counts[index]))
         height, width = metadata.size
         if len(chosen) * height * width > MAX_PIXELS_AT_ONCE:
             raise DataError(
-                self._shards[number].path,
-                f"{self._shards[number].keys[row]}: {len(chosen)} views of {height} x {width} are more than the "
+                shard.path,
+                f"{key}: {len(chosen)} views of {height} x {width} are more than the "
                 f"{MAX_PIXELS_AT_ONCE} pixels that are read at once; read fewer views",
             )
         # All are read before anything of their size is made: what a damaged json claims is made by nobody.
-        pictures = [self._picture(number, row, view, metadata) for view in chosen]
+        pictures = [self._picture(shard, row, f"{view:02d}.png", RGBA, metadata) for view in chosen]
         images = np.empty((len(chosen), 3, *metadata.size), np.float32)
         masks = np.empty((len(chosen), *metadata.size), np.bool_)
         for image, mask, picture in zip(images, masks, pictures, strict=True):
@@ -179,89 +169,40 @@ class ShardSet:
             except DataError as error:
                 raise BackgroundError(error.path, error.reason) from error
             _composite(image, mask, picture, behind)
-        depths = self._depth(number, row, chosen, metadata) if check_flag("ShardSet.read", "depth", depth) else None
-        grid = None if occupancy is None else self._occupancy(number, row, occupancy, metadata)
+        depths = grid = None
+        if check_flag("ShardSet.read", "depth", depth):
+            if metadata.depth_step is None:
+                raise DataError(shard.path, f"{key} has no depth; read it with depth=False")
+            steps = [self._picture(shard, row, f"{view:02d}.depth.png", DEPTH, metadata) for view in chosen]
+            depths = torch.from_numpy(np.stack(steps).astype(np.float32) * np.float32(metadata.depth_step))
+        if occupancy is not None:
+            if occupancy not in metadata.voxels or isinstance(occupancy, bool):
+                there = ", ".join(map(str, metadata.voxels)) or "none"
+                raise DataError(shard.path, f"{key} has no occupancy of {describe(occupancy)} voxels; it has {there}")
+            content = self._fetch(shard, row, f"vox{occupancy}.npy")
+            grid = torch.from_numpy(decode_occupancy(content, occupancy, shard.path, f"{key}.vox{occupancy}.npy"))
         return Sample(
             torch.from_numpy(images),
             metadata.cameras(chosen),
-            None if depths is None else torch.from_numpy(depths),
+            depths,
             torch.from_numpy(masks),
-            None if grid is None else torch.from_numpy(grid),
+            grid,
             metadata.mesh,
             metadata.category,
             metadata.name,
         )
 
-    def _picture(self, number: int, row: int, view: int, metadata: Metadata) -> np.ndarray:
-        shard = self._shards[number]
-        member = shard.member(row, f"{view:02d}.png")
-        return decode_picture(self._fetch(number, member), metadata.size, shard.path, member.name)
+    def _picture(self, shard: ShardIndex, row: int, suffix: str, kind: PngKind, metadata: Metadata) -> np.ndarray:
+        content = self._fetch(shard, row, suffix)
+        return decode_png(content, metadata.size, kind, shard.path, f"{shard.keys[row]}.{suffix}")
 
-    def _depth(self, number: int, row: int, views: Sequence[int], metadata: Metadata) -> np.ndarray:
-        shard = self._shards[number]
-        if metadata.depth_step is None:
-            raise DataError(shard.path, f"{shard.keys[row]} has no depth; read it with depth=False")
-        depths = []
-        for view in views:
-            member = shard.member(row, f"{view:02d}.depth.png")
-            content = self._fetch(number, member)
-            depths.append(decode_depth(content, metadata.size, metadata.depth_step, shard.path, member.name))
-        return np.stack(depths)
-
-    def _occupancy(self, number: int, row: int, side: int, metadata: Metadata) -> np.ndarray:
-        shard = self._shards[number]
-        if side not in metadata.voxels or isinstance(side, bool):
-            there = ", ".join(map(str, metadata.voxels)) or "none"
-            raise DataError(
-                shard.path, f"{shard.keys[row]} has no occupancy of {describe(side)} voxels; it has {there}"
-            )
-        member = shard.member(row, f"vox{side}.npy")
-        return decode_occupancy(self._fetch(number, member), side, shard.path, member.name)
-
-    def _fetch(self, number: int, member: Member) -> bytes:
-        """The content of a member, after a look at its header and its check sum."""
-        shard = self._shards[number]
-        handle = self._handles.get(number)
-        if handle is None:
-            if len(self._handles) >= OPEN_FILES:  # a file closes when its last reader lets go of it
-                self._handles.clear()
-            handle = self._handles[number] = _Handle(shard)
-        block = handle.read(member.offset - BLOCK, BLOCK + member.size)
-        if len(block) != BLOCK + member.size:
-            raise DataError(shard.path, f"ends inside {member.name}")
-        if block[:100].partition(b"\0")[0] != member.name.encode():
-            raise DataError(shard.path, f"{member.name} is not where the index says; does the index belong to it?")
-        content = block[BLOCK:]
-        if member.crc32 is not None and zlib.crc32(content) != member.crc32:
-            raise DataError(shard.path, f"{member.name} is damaged (a wrong check sum)")
-        return content
-
-
-class _Handle:
-    """A tar that is open for reading, until nobody uses it."""
-
-    def __init__(self, shard: ShardIndex) -> None:
-        self._descriptor = -1
-        self._path = shard.path
-        try:
-            # Without waiting: a pipe put in the file's place would not let go.
-            self._descriptor = os.open(shard.path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-            status = os.fstat(self._descriptor)
-        except OSError as error:
-            raise DataError(shard.path, f"cannot be read ({error})") from error
-        if not stat.S_ISREG(status.st_mode) or status.st_size != shard.bytes:
-            raise DataError(shard.path, f"has changed since it was opened: {status.st_size} bytes, not {shard.bytes}")
-
-    def read(self, offset: int, size: int) -> bytes:
-        """Bytes from a position, fewer at the end of the file."""
-        try:
-            return os.pread(self._descriptor, size, offset)
-        except OSError as error:
-            raise DataError(self._path, f"cannot be read ({error})") from error
-
-    def __del__(self) -> None:
-        if self._descriptor >= 0:
-            os.close(self._descriptor)
+    def _fetch(self, shard: ShardIndex, row: int, suffix: str) -> bytes:
+        tar = self._open.get(shard.path)
+        if tar is None:
+            if len(self._open) >= OPEN_FILES:  # a file closes when its last reader lets go of it
+                self._open.clear()
+            tar = self._open[shard.path] = ShardFile(shard.path, shard.size)
+        return shard.read(tar, row, suffix)
 
 
 def _is_shard(name: str) -> bool:

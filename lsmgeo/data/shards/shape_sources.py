@@ -1,0 +1,290 @@
+"""What a set of shards is made from: shapes of synthetic-13 by number, or files below a folder; all can be pickled."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple, Self, TypeAlias
+
+import numpy as np
+from torch import Tensor
+
+from lsmgeo import scenes
+from lsmgeo._checks import check_whole
+from lsmgeo.data.metadata import is_text
+from lsmgeo.data.sample import Sample
+from lsmgeo.data.shards.shape_sets import describe_shape, render_shapes
+from lsmgeo.errors import DataError, LsmGeoError, OptionError
+from lsmgeo.scenes import synthetic13
+
+__all__ = [
+    "FileSource",
+    "MeshFolder",
+    "Recipe",
+    "Rendered",
+    "Source",
+    "Synthetic13",
+    "open_source",
+    "rendered",
+    "sort_paths",
+    "spell_synset",
+    "split_by_name",
+    "walk",
+]
+
+# Raised when a change of the generators or of the renderer changes what a seed gives.
+VERSION = 1
+MESH_SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
+MAX_PATHS = 1_000_000
+# The last number of the seed that a mesh's lights are drawn from.
+LIGHTS = 2
+
+
+class Recipe(NamedTuple):
+    """How shapes are turned into views and voxels.
+
+    Attributes:
+        seed: decides shapes, lights and views.
+        views: number of views of a shape.
+        size: height and width of the images in pixels.
+        voxels: resolutions of the occupancy grids.
+        depth: whether depth is kept.
+        shadows: whether shapes cast shadows on themselves.
+    """
+
+    seed: int = 0
+    views: int = 20
+    size: int = 224
+    voxels: tuple[int, ...] = (32, 64)
+    depth: bool = True
+    shadows: bool = False
+
+
+class Rendered(NamedTuple):
+    """A shape as it goes into a shard."""
+
+    sample: Sample  # with the first of the occupancy grids
+    more_occupancy: tuple[Tensor, ...]
+    split: str
+
+
+@dataclass(frozen=True)
+class Synthetic13:
+    """The parametric shapes of `lsmgeo.scenes.synthetic13`; its methods are those of `FileSource`."""
+
+    count: int
+    name: str = "synthetic-13"
+
+    def __len__(self) -> int:
+        return self.count
+
+    def part(self, start: int, stop: int) -> Self:
+        """Itself: a shape is made from its number."""
+        return self
+
+    def identity(self) -> Any:
+        """The version of the generators."""
+        return VERSION
+
+    def file(self, index: int) -> str:
+        """Its number."""
+        return f"shape {index}"
+
+    def render(self, index: int, recipe: Recipe) -> Rendered:
+        """Views and voxels of one synthetic shape, exact."""
+        spec = describe_shape(recipe.seed, index, recipe.views, recipe.size)
+        sample = render_shapes([spec], depth=recipe.depth, shadows=recipe.shadows)[0]
+        grids = [scenes.voxels([spec.shape.scene], resolution)[0] for resolution in recipe.voxels]
+        return rendered(sample, grids, synthetic13.split(recipe.seed, index))
+
+
+def rendered(sample: Sample, grids: Sequence[Tensor], split: str) -> Rendered:
+    """A shape with its occupancy grids."""
+    return Rendered(sample._replace(occupancy=grids[0] if grids else None), tuple(grids[1:]), split)
+
+
+@dataclass(frozen=True)
+class FileSource(ABC):
+    """Shapes that are made from files below a folder, in the order of their paths.
+
+    Attributes:
+        root: the folder.
+        paths: of the shapes, relative to the root, with forward slashes.
+        name: what its shards are called.
+        first: the number of the first.
+    """
+
+    root: Path
+    paths: tuple[str, ...]
+    name: str
+    first: int = 0
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def part(self, start: int, stop: int) -> Self:
+        """These shapes alone, which keep their numbers: a task need not carry the paths of a whole tree."""
+        return replace(self, paths=self.paths[start - self.first : stop - self.first], first=start)
+
+    def file(self, index: int) -> str:
+        """Its path."""
+        return str(self.root / self.paths[index - self.first])
+
+    def digests(self, path: str) -> list[tuple[str, str]]:
+        """Name and SHA-256 of the files of a shape."""
+        try:
+            digests = []
+            for file in self._files(self.root / path):
+                with file.open("rb") as stream:
+                    digests.append((file.name, hashlib.file_digest(stream, "sha256").hexdigest()))
+            return digests
+        except OSError as error:
+            return [("", f"cannot be read ({error})")]
+
+    def render(self, index: int, recipe: Recipe) -> Rendered:
+        """Views and voxels of one shape.
+
+        Raises:
+            DataError: its files cannot be used.
+        """
+        try:
+            return self._render(index, recipe)
+        except DataError:
+            raise
+        except LsmGeoError as error:  # what only shows when it is used: no extent, colours out of range
+            raise DataError(self.file(index), str(error)) from error
+
+    @abstractmethod
+    def identity(self) -> Any:
+        """What the shapes depend on besides the recipe, as JSON can hold it."""
+
+    @abstractmethod
+    def _files(self, path: Path) -> list[Path]:
+        """What a shape is made from, in order."""
+
+    @abstractmethod
+    def _render(self, index: int, recipe: Recipe) -> Rendered:
+        """Views and voxels of one shape."""
+
+
+class MeshFolder(FileSource):
+    """The meshes below a folder.
+
+    The first folder below the root names the category; a ShapeNet synset is spelt out. Meshes are centred, and scaled
+    so that the diagonal of the box around them is 1.
+    """
+
+    def identity(self) -> Any:
+        """SHA-256 of the files and of the material files beside them, and what casts the rays."""
+        caster = "embree" if find_spec("embreex") else "numpy"  # what render_mesh takes
+        return [VERSION, caster, [[path, *(digest for _, digest in self.digests(path))] for path in self.paths]]
+
+    def _files(self, path: Path) -> list[Path]:
+        return [path, *(sorted(path.parent.glob("*.mtl")) if path.suffix.lower() == ".obj" else [])]
+
+    def _render(self, index: int, recipe: Recipe) -> Rendered:
+        from lsmgeo.data.mesh_rendering import render_mesh
+        from lsmgeo.data.meshes import load_mesh, normalise
+        from lsmgeo.data.voxelise import voxelise
+
+        file = self.paths[index - self.first]
+        mesh = normalise(load_mesh(self.root / file))
+        cameras = synthetic13.views(recipe.seed, index, recipe.views, recipe.size)
+        lights = synthetic13.random_lights(np.random.default_rng([recipe.seed, index, LIGHTS]))
+        picture = render_mesh(mesh, cameras, lights, shadows=recipe.shadows)
+        if not picture.mask.any():
+            raise DataError(self.root / file, "is seen in none of the views")
+        # A lampshade or a sail has hardly a voxel whose centre it holds.
+        grids = [voxelise(mesh, resolution, keep_thin=True) for resolution in recipe.voxels]
+        depth = picture.depth if recipe.depth else None
+        sample = Sample(picture.images, cameras, depth, picture.mask, None, file, _category(file), file)
+        return rendered(sample, grids, split_by_name(file))
+
+
+def _category(file: str) -> str | None:
+    first, slash, _ = file.partition("/")
+    return (spell_synset(first) or first) if slash else None
+
+
+def spell_synset(synset: str) -> str | None:
+    """The name of a ShapeNet category, or None.
+
+    Example:
+        >>> spell_synset("03001627")
+        'chair'
+    """
+    return {number: name for name, number in synthetic13.CATEGORIES.items()}.get(synset)
+
+
+Source: TypeAlias = Synthetic13 | FileSource
+
+
+def split_by_name(name: str) -> str:
+    """The part of a set that a name belongs to, 0.7 / 0.1 / 0.2 in expectation, whatever else the set holds.
+
+    Example:
+        >>> split_by_name("03001627/1a6f615e8b1b5ae4dbbc9440457e303e/models/model_normalized.obj")
+        'train'
+    """
+    place = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]) / 2**64
+    return "train" if place < 0.7 else "val" if place < 0.8 else "test"
+
+
+def open_source(source: str | Path, shapes: int | None = None) -> Source:
+    """Open what shapes are made from.
+
+    Args:
+        source: "synthetic-13", or a folder of meshes (a ShapeNetCore tree, or any other).
+        shapes: number of shapes; of a folder at most so many, all by default.
+
+    Raises:
+        OptionError: no number of shapes for synthetic-13, or fewer than one.
+        DataError: the folder cannot be read or holds no mesh.
+    """
+    if shapes is not None:
+        shapes = check_whole("render_set", "shapes", shapes, 1, 10**8)
+    if str(source) == "synthetic-13":
+        if shapes is None:
+            raise OptionError("render_set: shapes must be given for synthetic-13, which has no end; got None")
+        return Synthetic13(shapes)
+    root = Path(source)
+    if not root.is_dir():
+        raise DataError(root, "is no folder of meshes, and not 'synthetic-13'")
+    root = root.resolve()
+    meshes = (folder / name for folder, names in walk(root) for name in names if name.lower().endswith(MESH_SUFFIXES))
+    found = sort_paths(root, (file for file in meshes if not file.is_symlink()), f"mesh ({', '.join(MESH_SUFFIXES)})")
+    strange = next((file for file in found if not is_text(file)), None)
+    if strange is not None:
+        raise DataError(root, f"holds a mesh whose name is too long or not printable: {strange[:80]!r}")
+    return MeshFolder(root, found[:shapes], root.name.lstrip(".") or "meshes")
+
+
+def walk(root: Path) -> Iterator[tuple[Path, list[str]]]:
+    """The folders below a folder and the names of their files; links to folders are not followed.
+
+    Raises:
+        DataError: a folder cannot be read.
+    """
+
+    def refuse(error: OSError) -> None:
+        raise DataError(error.filename or root, f"cannot be read ({error})") from error
+
+    for folder, _, names in os.walk(root, onerror=refuse):
+        yield Path(folder), names
+
+
+def sort_paths(root: Path, paths: Iterable[Path], what: str) -> tuple[str, ...]:
+    """Paths below a folder, relative to it and with forward slashes, in order.
+
+    Raises:
+        DataError: there is none, or too many.
+    """
+    found = tuple(sorted(path.relative_to(root).as_posix() for path in paths))
+    if not 1 <= len(found) <= MAX_PATHS:
+        raise DataError(root, f"holds {len(found) or 'no'} {what}; 1 to {MAX_PATHS} are expected")
+    return found

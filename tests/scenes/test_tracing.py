@@ -40,7 +40,6 @@ def compare(found: scenes.Rendering, wanted: Drawn, dtype: torch.dtype) -> None:
         np.testing.assert_allclose(error, 0, atol=1e-8 if dtype == torch.float64 else 2e-3)
 
 
-@settings(max_examples=100)
 @given(drawn())
 def test_pictures_agree_with_the_oracle(wanted):
     found = scenes.render([wanted.scene], wanted.cameras, SUN, dtype=torch.float64)
@@ -94,7 +93,6 @@ def test_rays_from_anywhere_agree_with_the_oracle(wanted):
     assert found.distance[0].numpy()[~np.isfinite(expected) & clear].min(initial=np.inf) == np.inf
 
 
-@settings(max_examples=100)
 @given(drawn(), st.integers(0, 2**20))
 def test_occupancy_agrees_with_the_oracle(wanted, seed):
     points = np.random.default_rng(seed).uniform(-1, 1, (500, 3))

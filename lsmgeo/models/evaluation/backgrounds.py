@@ -4,22 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lsmgeo.models.evaluation.contenders import Contender, pick
+from lsmgeo.models.evaluation.contenders import Contender
 from lsmgeo.models.evaluation.iou import measure_iou
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.paper import IOU, paper_row
 from lsmgeo.models.evaluation.plots import Curve, draw_curves
-from lsmgeo.models.evaluation.report import Report, Row, Table, facts_of
+from lsmgeo.models.evaluation.report import Report, Row, Table
 from lsmgeo.models.evaluation.scores import Scores, joined
 from lsmgeo.models.evaluation.shapes import Shapes
 
 __all__ = ["report_backgrounds"]
 
-VIEWS = 4
 PAPER = ("V-LSM", "V-LSM w/bg")
 
 
-def report_backgrounds(contenders: Sequence[Contender], shapes: Shapes, options: Options) -> Report:
+def report_backgrounds(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
     """Measure IoU of every model in front of white and in front of `options.background`.
 
     The paper trains and tests "V-LSM w/bg" on random images as backgrounds; a model that was trained on white alone
@@ -28,17 +27,15 @@ def report_backgrounds(contenders: Sequence[Contender], shapes: Shapes, options:
     Args:
         contenders: voxel models of one resolution.
         shapes: what is evaluated on.
-        options: views (4), background, threshold, batch.
+        views: 4 in the paper.
+        options: background, threshold, batch.
 
     Returns:
         Table "views" with two lines a model.
 
     Raises:
-        OptionError: a model that gives no voxels, or models of different resolutions.
+        OptionError: models of different resolutions.
     """
-    notes: list[str] = []
-    contenders = pick(contenders, "backgrounds", depth=False)
-    views = options.views_of(VIEWS, shapes.most_views, notes)
     backgrounds = {"white": "white", "random": options.background}
     measured = {
         words: measure_iou(contenders, shapes, views, options, hulls=False, background=background)
@@ -56,12 +53,11 @@ def report_backgrounds(contenders: Sequence[Contender], shapes: Shapes, options:
     return Report(
         "backgrounds",
         [Table("views", "voxel IoU [%], views:", [str(place) for place in places], rows)],
-        facts_of(contenders, shapes, options, views=views, background=str(options.background)),
+        {"views": views, "background": str(options.background)},
         joined(scores, "iou"),
         {
             "backgrounds": draw_curves(
                 curves, title="White and other backgrounds", data=shapes.about, across="views", up="voxel IoU [%]"
             )
         },
-        notes=notes,
     )

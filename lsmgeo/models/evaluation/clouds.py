@@ -13,13 +13,13 @@ from lsmgeo.classical.reconstruct import points_of
 from lsmgeo.data import Batch
 from lsmgeo.data.sample import first_views
 from lsmgeo.drawing import Picture, as_pixels, draw_depth, draw_points
-from lsmgeo.errors import OptionError
 from lsmgeo.metrics import depth_errors, point_cloud_scores
 from lsmgeo.models.evaluation.baselines import SWEEP, sweep_views
-from lsmgeo.models.evaluation.contenders import Contender, one_size, pick
+from lsmgeo.models.evaluation.contenders import Contender, shared
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.plots import sheet
-from lsmgeo.models.evaluation.report import Cell, Report, Row, Table, facts_of
+from lsmgeo.models.evaluation.report import Cell, Report, Row, Table
+from lsmgeo.models.evaluation.scores import means_of
 from lsmgeo.models.evaluation.shapes import Shapes, batches
 
 __all__ = ["joint_cloud", "report_clouds"]
@@ -31,7 +31,7 @@ TRUTH = "truth"
 NEAR = 0.015
 
 
-def report_clouds(contenders: Sequence[Contender], shapes: Shapes, options: Options) -> Report:
+def report_clouds(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
     """Draw depth maps, shaded from a shifted viewpoint, and the clouds of all views together.
 
     Of each depth map the object's pixels are taken, by the silhouettes, for both methods (plane sweep has no depth at
@@ -40,25 +40,21 @@ def report_clouds(contenders: Sequence[Contender], shapes: Shapes, options: Opti
     Args:
         contenders: depth models of one size of images.
         shapes: all of which are drawn.
-        options: views (20: the largest number), planes, window.
+        views: the largest number, 20 in the paper.
+        options: planes, window.
 
     Returns:
         A picture a shape and a PLY file for each cloud; a table of the mean depth error and of the cloud's F-score
         against the cloud of the true depths.
 
     Raises:
-        OptionError: a model that gives no depth, models of different sizes, or fewer than two views.
+        OptionError: models of different sizes.
     """
-    notes: list[str] = []
-    contenders = pick(contenders, "clouds", depth=True)
-    size = one_size(contenders)
-    most = options.views_of(COUNTS[-1], shapes.most_views, notes)
-    counts = [count for count in COUNTS if count < most] + [most]
-    if most < 2:
-        raise OptionError("evaluate: report 'clouds' needs two views at least, which plane sweep matches")
+    size = shared(contenders, "size")
+    counts = [count for count in COUNTS if count < views] + [views]
     pictures, clouds, measured = {}, {}, []
     methods = (SWEEP, *(contender.name for contender in contenders))
-    for batch in batches(shapes.at(size), most, 1, resolution=None, depth=True, progress=options.progress):
+    for batch in batches(shapes.at(size), views, 1, resolution=None, depth=True, progress=options.progress):
         shape = batch.name[0]
         found = {
             (name, count): depth
@@ -86,12 +82,12 @@ def report_clouds(contenders: Sequence[Contender], shapes: Shapes, options: Opti
             ("f-score", f"F-score of the cloud at {NEAR}, views:", 4, 3),
         )
     ]
-    facts = facts_of(contenders, shapes, options, views=counts, planes=options.planes, window=options.window, size=size)
+    facts = {"views": counts, "planes": options.planes, "window": options.window, "size": size}
     by_shape = [
         dict(zip(("name", "method", "views", "mean depth error", "f_score"), numbers, strict=True))
         for numbers in measured
     ]
-    return Report("clouds", tables, facts, by_shape, pictures, clouds, notes)
+    return Report("clouds", tables, facts, by_shape, pictures, clouds)
 
 
 def _depths(contenders: Sequence[Contender], batch: Batch, count: int, options: Options) -> dict[str, Tensor]:
@@ -141,12 +137,8 @@ def _draw(
 def _means(
     measured: Sequence[tuple[str, str, int, float, float]], name: str, counts: Sequence[int], place: int
 ) -> list[Cell]:
-    found = []
-    for count in counts:
-        values = [float(line[place]) for line in measured if line[1:3] == (name, count)]
-        error = float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
-        found.append(Cell(float(np.mean(values)), error))
-    return found
+    found = [[float(line[place]) for line in measured if line[1:3] == (name, count)] for count in counts]
+    return [means_of(values, ["all"] * len(values)) for values in found]
 
 
 def _file(name: str) -> str:

@@ -17,7 +17,7 @@ from lsmgeo.data.shards.shape_transforms import resize_views
 from lsmgeo.errors import OptionError
 from lsmgeo.scenes.synthetic13 import CLASS_SPLITS
 
-__all__ = ["Contender", "Training", "one_resolution", "one_size", "open_contenders", "pick"]
+__all__ = ["Contender", "Training", "open_contenders", "shared"]
 
 TITLES = {"voxel-lsm": "V-LSM", "depth-lsm": "D-LSM", "r2n2": "3D-R2N2", "r2n2-pose": "3D-R2N2 w/pose"}
 
@@ -181,43 +181,14 @@ def read_training(about: Mapping[str, Any]) -> Training:
     )
 
 
-def pick(contenders: Sequence[Contender], report: str, *, depth: bool) -> list[Contender]:
-    """The models that a report is about.
-
-    Args:
-        contenders: all.
-        report: its name, for messages.
-        depth: whether it is about depth.
-
-    Raises:
-        OptionError: there is none, or one that gives something else.
-    """
-    wanted, other = ("depth", "voxels") if depth else ("voxels", "depth")
-    for contender in contenders:
-        if contender.has_depth != depth:
-            raise OptionError(f"evaluate: report {report!r} is about {wanted}; {contender.name} gives {other}")
-    return list(contenders)
-
-
-def one_resolution(contenders: Sequence[Contender]) -> int:
-    """The voxels a side of all.
+def shared(contenders: Sequence[Contender], attribute: str) -> int:
+    """The ``resolution``, or the ``size``, that all models have.
 
     Raises:
         OptionError: they differ.
     """
-    return _one_of({contender.name: contender.resolution for contender in contenders}, "resolution of voxels")
-
-
-def one_size(contenders: Sequence[Contender]) -> int:
-    """Height and width of the pictures that all take.
-
-    Raises:
-        OptionError: they differ.
-    """
-    return _one_of({contender.name: contender.size for contender in contenders}, "size of pictures")
-
-
-def _one_of(found: Mapping[str, int], words: str) -> int:
+    found: dict[str, int] = {contender.name: getattr(contender, attribute) for contender in contenders}
     if len(set(found.values())) != 1:
+        words = {"resolution": "resolution of voxels", "size": "size of pictures"}[attribute]
         raise OptionError(f"evaluate: models must have one {words}; got {found}")
     return next(iter(found.values()))

@@ -10,26 +10,24 @@ from torch import Tensor
 from lsmgeo.cameras import select
 from lsmgeo.data import Batch
 from lsmgeo.drawing import Picture, as_pixels, draw_depth
-from lsmgeo.errors import OptionError
 from lsmgeo.metrics import depth_errors, median_depth_error
 from lsmgeo.models.evaluation.baselines import SURE, SWEEP, Swept, sweep_views
-from lsmgeo.models.evaluation.contenders import Contender, one_size, pick
+from lsmgeo.models.evaluation.contenders import Contender, shared
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.paper import DEPTH, paper_categories
 from lsmgeo.models.evaluation.plots import sheet
-from lsmgeo.models.evaluation.report import Cell, Report, Row, Table, facts_of
+from lsmgeo.models.evaluation.report import Cell, Report, Row, Table
 from lsmgeo.models.evaluation.scores import Scores, joined
 from lsmgeo.models.evaluation.shapes import Shapes, batches
 
 __all__ = ["report_depth"]
 
-VIEWS = 10
 # Of a picture: side in pixels, and the shapes that are drawn.
 SIDE, MOST_DRAWN = 160, 13
 MEASURES = ("median", "mean", "median, sure", "median, all", "mean, all", "has depth [%]", "is sure [%]")
 
 
-def report_depth(contenders: Sequence[Contender], shapes: Shapes, options: Options) -> Report:
+def report_depth(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
     """Measure depth maps of 10 views, as the paper does (section 4, "Comparision to Plane Sweeping").
 
     Plane sweep takes the same pictures: 300 planes over 2 -+ sqrt(3) / 2, 5 x 5 ZNCC, every view with all others. A
@@ -39,7 +37,8 @@ def report_depth(contenders: Sequence[Contender], shapes: Shapes, options: Optio
     Args:
         contenders: depth models of one size of images.
         shapes: what is evaluated on, with depth.
-        options: views (10), planes, window, batch.
+        views: 10 in the paper.
+        options: planes, window, batch.
 
     Returns:
         Table "categories" in world units; "measures" with mean errors besides, the median over the pixels where plane
@@ -47,14 +46,9 @@ def report_depth(contenders: Sequence[Contender], shapes: Shapes, options: Optio
         pixels.
 
     Raises:
-        OptionError: a model that gives no depth, models of different sizes, or one view alone.
+        OptionError: models of different sizes.
     """
-    notes: list[str] = []
-    contenders = pick(contenders, "depth", depth=True)
-    size = one_size(contenders)
-    views = options.views_of(VIEWS, shapes.most_views, notes)
-    if views < 2:
-        raise OptionError("evaluate: report 'depth' needs two views at least, which plane sweep matches")
+    size = shared(contenders, "size")
     scores = {name: Scores() for name in (SWEEP, *(contender.name for contender in contenders))}
     rows_drawn: dict[str, list[Picture | None]] = {}
     for batch in batches(shapes.at(size), views, options.batch, resolution=None, depth=True, progress=options.progress):
@@ -81,7 +75,7 @@ def report_depth(contenders: Sequence[Contender], shapes: Shapes, options: Optio
             Table("categories", "median depth error", [*categories, "mean"], rows, 3),
             Table("measures", "depth errors [world units]", MEASURES, measures, 4),
         ],
-        facts_of(contenders, shapes, options, views=views, planes=options.planes, window=options.window, size=size),
+        {"views": views, "planes": options.planes, "window": options.window, "size": size},
         joined(scores, ", ".join(MEASURES).replace(" [%]", "")),
         {
             "depth": sheet(
@@ -91,7 +85,6 @@ def report_depth(contenders: Sequence[Contender], shapes: Shapes, options: Optio
                 title=f"depth of the first view, seen from the side; {shapes.about}",
             )
         },
-        notes=notes,
     )
 
 

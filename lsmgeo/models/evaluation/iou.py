@@ -6,37 +6,34 @@ from collections.abc import Mapping, Sequence
 
 from lsmgeo.data.backgrounds import Background
 from lsmgeo.models.evaluation.baselines import HULL, STRICT_HULL, hull_iou
-from lsmgeo.models.evaluation.contenders import Contender, one_resolution, pick
+from lsmgeo.models.evaluation.contenders import Contender, shared
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.paper import IOU, IOU_OF_CATEGORIES, paper_categories, paper_row
 from lsmgeo.models.evaluation.plots import Curve, draw_curves
-from lsmgeo.models.evaluation.report import Cell, Report, Row, Table, facts_of
+from lsmgeo.models.evaluation.report import Cell, Report, Row, Table
 from lsmgeo.models.evaluation.scores import Scores, iou_by_view, joined
 from lsmgeo.models.evaluation.shapes import Shapes, batches
 
 __all__ = ["measure_iou", "report_iou", "table_of_views"]
 
-VIEWS = 8
 HULL_FALLS = "The 0.75 hull drops from 4 to 5 views because it needs all of 4 silhouettes, but only 4 of 5."
 
 
-def report_iou(contenders: Sequence[Contender], shapes: Shapes, options: Options) -> Report:
+def report_iou(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
     """Measure IoU after 1, 2, ... views: the mean of the categories, and every category.
 
     Args:
         contenders: voxel models of one resolution.
         shapes: what is evaluated on.
-        options: views (8), threshold, batch.
+        views: 8 in the paper.
+        options: threshold, batch.
 
     Returns:
         Table "views", and one a model of the categories; a picture of the curves.
 
     Raises:
-        OptionError: a model that gives no voxels, or models of different resolutions.
+        OptionError: models of different resolutions.
     """
-    notes: list[str] = []
-    contenders = pick(contenders, "iou", depth=False)
-    views = options.views_of(VIEWS, shapes.most_views, notes)
     scores = measure_iou(contenders, shapes, views, options, hulls=True)
     table = table_of_views("voxel IoU [%], views:", scores, views, _known(contenders))
     categories = sorted(set(shapes.categories))
@@ -53,10 +50,9 @@ def report_iou(contenders: Sequence[Contender], shapes: Shapes, options: Options
     return Report(
         "iou",
         [table, *classes],
-        facts_of(contenders, shapes, options, views=views, threshold=options.threshold),
+        {"views": views, "threshold": options.threshold},
         joined(scores, "iou"),
         {"iou": picture},
-        notes=notes,
     )
 
 
@@ -81,7 +77,7 @@ def measure_iou(
     """
     rules = {HULL: "mean", STRICT_HULL: "all"} if hulls else {}
     scores = {name: Scores() for name in (*(contender.name for contender in contenders), *rules)}
-    resolution = one_resolution(contenders)
+    resolution = shared(contenders, "resolution")
     for batch in batches(
         shapes, views, options.batch, resolution=resolution, background=background, progress=options.progress
     ):

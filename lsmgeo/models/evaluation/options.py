@@ -47,10 +47,3 @@ class Options:
             check_whole("evaluate", name, getattr(self, name), least, 2**32 - 1)
         if not [check_number("evaluate", "degrees", angle, "from 0 to 180", 0, 180) for angle in self.degrees]:
             raise OptionError("evaluate: degrees must be from 0 to 180; got none")
-
-    def views_of(self, usual: int, there: int, notes: list[str]) -> int:
-        """How many views are taken: those asked for or the usual number, as far as the data go, which is noted."""
-        wanted = self.views or usual
-        if wanted > there:
-            notes.append(f"the shapes have {there} views; {wanted} were wanted")
-        return min(wanted, there)

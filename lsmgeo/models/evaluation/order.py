@@ -8,16 +8,15 @@ import torch
 from torch import Tensor
 
 from lsmgeo.cameras import CameraTensors
-from lsmgeo.models.evaluation.contenders import Contender, one_resolution, pick
+from lsmgeo.models.evaluation.contenders import Contender, shared
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.plots import Curve, draw_curves
-from lsmgeo.models.evaluation.report import Cell, Report, Row, Table, facts_of
+from lsmgeo.models.evaluation.report import Cell, Report, Row, Table
 from lsmgeo.models.evaluation.scores import Scores, iou_by_view
 from lsmgeo.models.evaluation.shapes import ORDER, Shapes, batches, generator_of
 
 __all__ = ["report_order"]
 
-VIEWS = 8
 COUNTS = (2, 4, 8, 12, 16, 20)
 # Of a shape's IoU over the orders: mean, standard deviation, range; of its voxels: deviation of probabilities, and the
 # share of those that are occupied in some order that are not in another.
@@ -28,7 +27,7 @@ MEASURES = (
 OF_THE_SET = "range of the set [points]"
 
 
-def report_order(contenders: Sequence[Contender], shapes: Shapes, options: Options) -> Report:
+def report_order(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
     """Measure how results vary with the order of the views ("very little variance", Kar et al. 2017, section 3).
 
     The first 2, 4 and 8 views of every shape are given in several random orders. Measured are, per shape, the standard
@@ -38,22 +37,20 @@ def report_order(contenders: Sequence[Contender], shapes: Shapes, options: Optio
     Args:
         contenders: voxel models of one resolution.
         shapes: what is evaluated on.
-        options: views (8: the largest number), orders (8), seed, threshold, batch.
+        views: the largest number, 8 in the paper.
+        options: orders (8), seed, threshold, batch.
 
     Returns:
         A table a model, means of the categories; a picture of IoU with the deviation as bars.
 
     Raises:
-        OptionError: a model that gives no voxels, or fewer than two views.
+        OptionError: models of different resolutions.
     """
-    notes: list[str] = []
-    contenders = pick(contenders, "order", depth=False)
-    most = options.views_of(VIEWS, shapes.most_views, notes)
-    counts = [count for count in COUNTS if count < most] + ([most] if most > 1 else [])
+    counts = [count for count in COUNTS if count < views] + ([views] if views > 1 else [])
     scores = {(contender.name, count): Scores() for contender in contenders for count in counts}
     every_order = {key: Scores() for key in scores}
-    resolution = one_resolution(contenders)
-    for batch in batches(shapes, most, options.batch, resolution=resolution, progress=options.progress):
+    resolution = shared(contenders, "resolution")
+    for batch in batches(shapes, views, options.batch, resolution=resolution, progress=options.progress):
         assert batch.occupancy is not None
         for count in counts:
             orders = torch.stack([_orders(options.seed, name, count, options.orders) for name in batch.name])
@@ -86,7 +83,7 @@ def report_order(contenders: Sequence[Contender], shapes: Shapes, options: Optio
     return Report(
         "order",
         tables,
-        facts_of(contenders, shapes, options, views=counts, orders=options.orders, threshold=options.threshold),
+        {"views": counts, "orders": options.orders, "threshold": options.threshold},
         [
             {"model": name, "views": count, **shape}
             for (name, count), one in scores.items()
@@ -102,7 +99,6 @@ def report_order(contenders: Sequence[Contender], shapes: Shapes, options: Optio
                 bars="deviation over the orders",
             )
         },
-        notes=notes,
     )
 
 

@@ -10,19 +10,17 @@ from torch import Tensor
 from lsmgeo.cameras import CameraTensors, perturb, select, stack
 from lsmgeo.data import Batch
 from lsmgeo.models.evaluation.baselines import HULL, hull_iou
-from lsmgeo.models.evaluation.contenders import Contender, one_resolution, pick
+from lsmgeo.models.evaluation.contenders import Contender, shared
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.plots import Curve, draw_curves
-from lsmgeo.models.evaluation.report import Report, Row, Table, facts_of
+from lsmgeo.models.evaluation.report import Report, Row, Table
 from lsmgeo.models.evaluation.scores import Scores, iou_by_view, joined
 from lsmgeo.models.evaluation.shapes import Shapes, batches, noise_of
 
 __all__ = ["report_pose_noise", "turned"]
 
-VIEWS = 4
 
-
-def report_pose_noise(contenders: Sequence[Contender], shapes: Shapes, options: Options) -> Report:
+def report_pose_noise(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
     """Measure IoU with cameras turned about the object by random angles up to 0, 5, ... degrees.
 
     Every camera keeps looking at the object (`lsmgeo.cameras.perturb`), and its axis and the share of the largest angle
@@ -31,19 +29,17 @@ def report_pose_noise(contenders: Sequence[Contender], shapes: Shapes, options: 
     Args:
         contenders: voxel models of one resolution, such as one trained without noise and one with.
         shapes: what is evaluated on.
-        options: views (4), degrees, seed, threshold, batch.
+        views: 4 in the paper.
+        options: degrees, seed, threshold, batch.
 
     Returns:
         Table "degrees" with the IoU after all views, and a picture of the curves.
 
     Raises:
-        OptionError: a model that gives no voxels, or models of different resolutions.
+        OptionError: models of different resolutions.
     """
-    notes: list[str] = []
-    contenders = pick(contenders, "pose-noise", depth=False)
-    views = options.views_of(VIEWS, shapes.most_views, notes)
     angles = tuple(sorted(set(options.degrees)))
-    resolution = one_resolution(contenders)
+    resolution = shared(contenders, "resolution")
     scores = {name: Scores() for name in (*(contender.name for contender in contenders), HULL)}
     for batch in batches(shapes, views, options.batch, resolution=resolution, progress=options.progress):
         assert batch.occupancy is not None
@@ -63,7 +59,7 @@ def report_pose_noise(contenders: Sequence[Contender], shapes: Shapes, options: 
     return Report(
         "pose-noise",
         [Table("degrees", f"voxel IoU [%], {views} views, noise up to:", columns, rows)],
-        facts_of(contenders, shapes, options, views=views, degrees=list(angles), threshold=options.threshold),
+        {"views": views, "degrees": list(angles), "threshold": options.threshold},
         joined(scores, "iou"),
         {
             "pose-noise": draw_curves(
@@ -74,7 +70,6 @@ def report_pose_noise(contenders: Sequence[Contender], shapes: Shapes, options: 
                 up="voxel IoU [%]",
             )
         },
-        notes=notes,
     )
 
 

@@ -10,18 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lsmgeo.data import write_atomic, write_point_cloud
 
-if TYPE_CHECKING:
-    from lsmgeo.models.evaluation.contenders import Contender
-    from lsmgeo.models.evaluation.options import Options
-    from lsmgeo.models.evaluation.shapes import Shapes
-
-__all__ = ["Cell", "Report", "Row", "Table", "facts_of", "finite", "format_table", "write_report"]
+__all__ = ["Cell", "Report", "Row", "Table", "finite", "format_table", "write_report"]
 
 MARK = "*"
 
@@ -82,28 +77,6 @@ class Report:
     pictures: Mapping[str, bytes] = field(default_factory=dict)
     clouds: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
     notes: Sequence[str] = ()
-
-
-def facts_of(contenders: Sequence[Contender], shapes: Shapes, options: Options, **settings: Any) -> dict[str, Any]:
-    """The data, the models and the settings of a report, as JSON can hold them.
-
-    Args:
-        contenders: the models.
-        shapes: what was evaluated on.
-        options: the seed.
-        settings: what else the figures depend on.
-    """
-    models = [
-        {
-            "name": contender.name,
-            "network": contender.kind,
-            "path": contender.path,
-            "trained on": contender.training.words or "all categories, white",
-            "parameters": sum(parameter.numel() for parameter in contender.model.parameters()),
-        }
-        for contender in contenders
-    ]
-    return {"data": shapes.about, "models": models, "seed": options.seed, **settings}
 
 
 def format_table(table: Table) -> str:

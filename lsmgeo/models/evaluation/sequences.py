@@ -7,41 +7,38 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from lsmgeo.drawing import Picture, as_pixels, draw_voxels
-from lsmgeo.models.evaluation.contenders import Contender, one_resolution, pick
+from lsmgeo.models.evaluation.contenders import Contender, shared
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.plots import sheet
-from lsmgeo.models.evaluation.report import Report, Row, Table, facts_of
+from lsmgeo.models.evaluation.report import Report, Row, Table
 from lsmgeo.models.evaluation.scores import Scores, iou_by_view, joined
 from lsmgeo.models.evaluation.shapes import Shapes, batches
 
 __all__ = ["report_sequences"]
 
-VIEWS = 4
 SIDE = 256
 # More shapes than this are measured, not drawn.
 MOST_DRAWN = 26
 
 
-def report_sequences(contenders: Sequence[Contender], shapes: Shapes, options: Options) -> Report:
+def report_sequences(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
     """Draw what models predict after each of a sequence of views (Kar et al. 2017, figure 3), with the IoU of each.
 
     Args:
         contenders: voxel models of one resolution: in the paper V-LSM and 3D-R2N2 w/pose.
         shapes: of which the first 26 are drawn.
-        options: views (4), threshold, batch.
+        views: 4 in the paper.
+        options: threshold, batch.
 
     Returns:
         A picture a shape and a table of their IoU.
 
     Raises:
-        OptionError: a model that gives no voxels, or models of different resolutions.
+        OptionError: models of different resolutions.
     """
-    notes: list[str] = []
-    contenders = pick(contenders, "sequences", depth=False)
-    views = options.views_of(VIEWS, shapes.most_views, notes)
     scores = {contender.name: Scores() for contender in contenders}
     pictures: dict[str, bytes] = {}
-    resolution = one_resolution(contenders)
+    resolution = shared(contenders, "resolution")
     for batch in batches(shapes, views, options.batch, resolution=resolution, progress=options.progress):
         assert batch.occupancy is not None
         found = {contender.name: contender.occupancies(batch.images, batch.cameras) for contender in contenders}
@@ -60,9 +57,8 @@ def report_sequences(contenders: Sequence[Contender], shapes: Shapes, options: O
         Table(name, f"{name}, voxel IoU [%], views:", columns, [Row("mean of categories", one.cells(100))])
         for name, one in scores.items()
     ]
-    if len(names) > len(pictures):
-        notes.append(f"{len(pictures)} of {len(names)} shapes are drawn")
-    facts = facts_of(contenders, shapes, options, views=views, threshold=options.threshold)
+    notes = [f"{len(pictures)} of {len(names)} shapes are drawn"] if len(names) > len(pictures) else []
+    facts = {"views": views, "threshold": options.threshold}
     return Report("sequences", tables, facts, joined(scores, "iou"), pictures, notes=notes)
 
 

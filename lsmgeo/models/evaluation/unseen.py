@@ -6,20 +6,18 @@ import math
 from collections.abc import Mapping, Sequence
 
 from lsmgeo.errors import OptionError
-from lsmgeo.models.evaluation.contenders import Contender, pick
+from lsmgeo.models.evaluation.contenders import Contender
 from lsmgeo.models.evaluation.iou import measure_iou
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.plots import Curve, draw_curves
-from lsmgeo.models.evaluation.report import Report, Row, Table, facts_of
+from lsmgeo.models.evaluation.report import Report, Row, Table
 from lsmgeo.models.evaluation.scores import Scores, joined
 from lsmgeo.models.evaluation.shapes import Shapes
 
 __all__ = ["report_unseen"]
 
-VIEWS = 8
 
-
-def report_unseen(contenders: Sequence[Contender], shapes: Shapes, options: Options) -> Report:
+def report_unseen(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
     """Measure the drop of IoU on unseen categories by the number of views.
 
     Equation: for a category C that a model has not been trained on, the IoU of the same network trained on all
@@ -30,7 +28,8 @@ def report_unseen(contenders: Sequence[Contender], shapes: Shapes, options: Opti
         contenders: of every network one model trained on all categories and one at least trained on some: the paper
             has V-LSM and 3D-R2N2 w/pose, each trained on all, on the first and on the second part of the categories.
         shapes: what is evaluated on, of all categories.
-        options: views (8), threshold, batch.
+        views: 8 in the paper.
+        options: threshold, batch.
 
     Returns:
         Tables "drop" and "categories" (with all views), a picture of the curves.
@@ -38,10 +37,7 @@ def report_unseen(contenders: Sequence[Contender], shapes: Shapes, options: Opti
     Raises:
         OptionError: a model has no counterpart, or models of different resolutions.
     """
-    notes: list[str] = []
-    contenders = pick(contenders, "unseen", depth=False)
     pairs = _pairs(contenders, set(shapes.categories))
-    views = options.views_of(VIEWS, shapes.most_views, notes)
     scores = measure_iou(contenders, shapes, views, options, hulls=False)
     drops = {title: _drop(scores, some, seen_by) for title, (seen_by, some) in pairs.items()}
     columns = [str(view) for view in range(1, views + 1)]
@@ -66,7 +62,7 @@ def report_unseen(contenders: Sequence[Contender], shapes: Shapes, options: Opti
                 [Row(name, one.cells(100)) for name, one in scores.items()],
             ),
         ],
-        facts_of(contenders, shapes, options, views=views, threshold=options.threshold),
+        {"views": views, "threshold": options.threshold},
         joined(scores, "iou"),
         {
             "unseen": draw_curves(
@@ -77,7 +73,6 @@ def report_unseen(contenders: Sequence[Contender], shapes: Shapes, options: Opti
                 up="drop of IoU [points]",
             )
         },
-        notes=notes,
     )
 
 

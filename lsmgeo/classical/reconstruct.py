@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -169,136 +169,92 @@ def reconstruct_scene(
         OptionError: an option out of range, or no range or neighbours can be told.
         DataError: a photograph cannot be read.
     """
-    sweeper = _Sweeper(scene, neighbours, size, planes, spacing, near, far, score, window, filtered, density, memory)
+    for name, number, least in (("neighbours", neighbours, 1), ("size", size, 16), ("planes", planes, 3)):
+        if number < least:
+            raise OptionError(f"{name} must be at least {least}; got {number}")
+    if planes > MOST_PLANES:
+        raise OptionError(f"planes must be at most {MOST_PLANES}; got {planes}")
+    if not 0 < density <= 1:
+        raise OptionError(f"density must lie in (0, 1]; got {density}")
     chosen = list(range(len(scene))) if views is None else list(views)
     if not chosen or len(set(chosen)) != len(chosen):
         raise OptionError(f"views must name at least one view, none twice; got {views}")
     for view in chosen:
-        sweeper.check_view(view)
+        if not 0 <= view < len(scene):
+            raise OptionError(f"view must lie in 0..{len(scene) - 1}; got {view}")
     check_whole("reconstruct_scene", "resolution", resolution, 8)
     if min_support is None:
         min_support = min(1, len(chosen) - 1)
     min_support = check_whole("reconstruct_scene", "min_support", min_support, 0, len(chosen) - 1)
     is_one = len(chosen) == 1
-    with tqdm(chosen, desc="sweep", unit="view", disable=None if progress and not is_one else True) as bar:
-        alone = [sweeper.reconstruct(view, progress and is_one) for view in bar]
-    swept = tuple(sweeper.supported(one, alone, min_support) for one in alone)
+    alone = []
+    for view in tqdm(chosen, desc="sweep", unit="view", disable=None if progress and not is_one else True):
+        start, end = _depth_range(scene, view, near, far, min(COARSE_SIZE, size), memory)
+        matched = select_neighbours(scene, view, neighbours, near=start, far=end)
+        images, cameras = gather(scene, (view, *matched), size)
+        depths = sweep_planes(cameras, start, end, planes, spacing)
+        depth_map = sweep(
+            images,
+            cameras,
+            depths,
+            score=score,
+            window=window,
+            cost_filter=guided_filter(images[0]) if filtered else None,
+            noise=NOISE,
+            memory=memory,
+            progress=progress and is_one,
+        )
+        alone.append(_Swept(view, tuple(matched), depths, images[0].clone(), select(cameras, 0, 0), depth_map))
+    swept = tuple(_keep(scene, one, alone, min_support, density) for one in alone)
     points = np.concatenate([one.points for one in swept])
     colours = np.concatenate([one.colours for one in swept])
     surface = surface_of(swept, points, resolution) if mesh and len(points) else None
     return SceneReconstruction(swept, points, colours, surface)
 
 
-@dataclass(frozen=True)
-class _Sweeper:
-    """The checked options of sweeps through the views of one scene."""
+class _Swept(NamedTuple):
+    """The first fields of a `Reconstruction`, which are known before other views are asked."""
 
-    scene: PosedImages
-    neighbours: int
-    size: int
-    planes: int
-    spacing: str
-    near: float | None
-    far: float | None
-    score: str
-    window: int
-    filtered: bool
-    density: float
-    memory: int
+    view: int
+    neighbours: tuple[int, ...]
+    depths: Tensor
+    image: Tensor
+    camera: CameraTensors
+    depth_map: DepthMap
 
-    def __post_init__(self) -> None:
-        for name, number, least in (
-            ("neighbours", self.neighbours, 1),
-            ("size", self.size, 16),
-            ("planes", self.planes, 3),
-        ):
-            if number < least:
-                raise OptionError(f"{name} must be at least {least}; got {number}")
-        if self.planes > MOST_PLANES:
-            raise OptionError(f"planes must be at most {MOST_PLANES}; got {self.planes}")
-        if not 0 < self.density <= 1:
-            raise OptionError(f"density must lie in (0, 1]; got {self.density}")
 
-    def check_view(self, view: int) -> None:
-        if not 0 <= view < len(self.scene):
-            raise OptionError(f"view must lie in 0..{len(self.scene) - 1}; got {view}")
+def _depth_range(
+    scene: PosedImages, view: int, near: float | None, far: float | None, size: int, memory: int
+) -> tuple[float, float]:
+    if near is None or far is None:
+        lower, upper = find_depth_range(scene, view, size=size, noise=NOISE, memory=memory)
+        if (near or lower) >= (far or upper):
+            lower, upper = default_depth_range(scene, view)
+        near, far = near if near is not None else lower, far if far is not None else upper
+    if not 0 < near < far < float("inf"):
+        raise OptionError(f"near and far must be positive, finite and ascending; got {near} and {far}")
+    return near, far
 
-    def depth_range(self, view: int) -> tuple[float, float]:
-        near, far = self.near, self.far
-        if near is None or far is None:
-            lower, upper = find_depth_range(
-                self.scene, view, size=min(COARSE_SIZE, self.size), noise=NOISE, memory=self.memory
-            )
-            if (near or lower) >= (far or upper):
-                lower, upper = default_depth_range(self.scene, view)
-            near, far = near if near is not None else lower, far if far is not None else upper
-        if not 0 < near < far < float("inf"):
-            raise OptionError(f"near and far must be positive, finite and ascending; got {near} and {far}")
-        return near, far
 
-    def reconstruct(self, view: int, progress: bool) -> Reconstruction:
-        scene = self.scene
-        near, far = self.depth_range(view)
-        chosen = select_neighbours(scene, view, self.neighbours, near=near, far=far)
-        images, cameras = gather(scene, (view, *chosen), self.size)
-        depths = sweep_planes(cameras, near, far, self.planes, self.spacing)
-        depth_map = sweep(
-            images,
-            cameras,
-            depths,
-            score=self.score,
-            window=self.window,
-            cost_filter=guided_filter(images[0]) if self.filtered else None,
-            noise=NOISE,
-            memory=self.memory,
-            progress=progress,
-        )
-        camera = select(cameras, 0, 0)
-        one = Reconstruction(
-            view=view,
-            neighbours=tuple(chosen),
-            depths=depths,
-            image=images[0].clone(),
-            camera=camera,
-            depth_map=depth_map,
-            mask=torch.zeros(images.shape[-2:], dtype=torch.bool),
-            points=np.empty((0, 3), np.float32),
-            colours=np.empty((0, 3), np.uint8),
-            error=None,
-        )
-        return self._keep(one, depth_map.confidence > LEAST_CONFIDENCE)
-
-    def supported(self, one: Reconstruction, swept: Sequence[Reconstruction], least: int) -> Reconstruction:
-        """A reconstruction with what the others say of it."""
-        centers = camera_centers(self.scene.cameras)
-        others = sorted(
-            (other for other in swept if other.view != one.view),
-            key=lambda other: float(np.linalg.norm(centers[other.view] - centers[one.view])),
-        )[:MOST_CHECKED]
-        if not others:
-            return one
-        support = consistent_views(
-            one.depth_map.depth,
-            one.camera,
-            [other.depth_map.depth for other in others],
-            [other.camera for other in others],
-        )
+def _keep(scene: PosedImages, one: _Swept, swept: Sequence[_Swept], least: int, density: float) -> Reconstruction:
+    """The best of the pixels of one view that so many of the others agree with."""
+    depth_map, support = one.depth_map, None
+    depth, allowed = depth_map.depth, depth_map.confidence > LEAST_CONFIDENCE
+    away = np.linalg.norm((centers := camera_centers(scene.cameras)) - centers[one.view], axis=1)
+    others = sorted((other for other in swept if other is not one), key=lambda other: float(away[other.view]))
+    if others := others[:MOST_CHECKED]:
+        maps, cameras = [other.depth_map.depth for other in others], [other.camera for other in others]
+        support = consistent_views(depth, one.camera, maps, cameras)
+        allowed = (support >= least) & (depth_map.confidence > LEAST_CONFIDENCE_AGREED)
         # Any pixel with more support comes before all with less; beyond two, more says nothing.
         most = min(len(others), 2)
-        confidence = (support.clamp_max(most) + one.depth_map.confidence) / (most + 1)
-        depth_map = one.depth_map._replace(confidence=torch.where(one.depth_map.depth > 0, confidence, 0.0))
-        allowed = (support >= least) & (one.depth_map.confidence > LEAST_CONFIDENCE_AGREED)
-        return self._keep(replace(one, depth_map=depth_map, support=support), allowed)
-
-    def _keep(self, one: Reconstruction, allowed: Tensor) -> Reconstruction:
-        """A reconstruction with the best of the allowed pixels."""
-        depth_map = one.depth_map
-        specks = round(SPECK_FRACTION * depth_map.depth.numel())
-        mask = kept(depth_map._replace(depth=torch.where(allowed, depth_map.depth, 0.0)), self.density, specks=specks)
-        points = points_of(depth_map.depth, one.camera)[mask].float().numpy()
-        colours = as_pixels(one.image)[mask]
-        error = sparse_error(self.scene, one.view, depth_map, kept(depth_map, self.density))
-        return replace(one, mask=mask, points=points, colours=colours, error=error)
+        confidence = (support.clamp_max(most) + depth_map.confidence) / (most + 1)
+        depth_map = depth_map._replace(confidence=torch.where(depth > 0, confidence, 0.0))
+    specks = round(SPECK_FRACTION * depth.numel())
+    mask = kept(depth_map._replace(depth=torch.where(allowed, depth, 0.0)), density, specks=specks)
+    points, colours = points_of(depth, one.camera)[mask].float().numpy(), as_pixels(one.image)[mask]
+    error = sparse_error(scene, one.view, depth_map, kept(depth_map, density))
+    return Reconstruction(*one[:-1], depth_map, mask, points, colours, error, support)
 
 
 def surface_of(swept: Sequence[Reconstruction], points: np.ndarray, resolution: int) -> Mesh:

@@ -178,7 +178,8 @@ def reconstruct(
     from pathlib import Path
 
     from lsmgeo import data
-    from lsmgeo.classical.methods import hull_results, readable, sweep_results
+    from lsmgeo.classical.hull_scene import hull_results
+    from lsmgeo.classical.methods import readable, sweep_results
     from lsmgeo.classical.outputs import write_results
     from lsmgeo.errors import OptionError
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,22 +13,23 @@ from lsmgeo import functional
 from lsmgeo._checks import check_choice, check_whole
 from lsmgeo.cameras import CameraTensors, crop, resize, select, stack
 from lsmgeo.classical.gathering import fitted, resized
-from lsmgeo.classical.outputs import Looked
+from lsmgeo.classical.methods import mesh_facts, named_colour
+from lsmgeo.classical.outputs import Looked, Results
 from lsmgeo.classical.silhouettes import signed_distance, silhouettes
 from lsmgeo.classical.surface import drop_specks, extract_mesh
 from lsmgeo.classical.tsdf import voxel_side
+from lsmgeo.classical.views import camera_centers
 from lsmgeo.classical.visual_hull import RULES, default_grid, visual_hull
 from lsmgeo.data.meshes import Mesh
 from lsmgeo.errors import OptionError
 
 if TYPE_CHECKING:
-    import os
     from collections.abc import Sequence
 
     from lsmgeo.data import PosedImages
     from lsmgeo.grids import VoxelGrid
 
-__all__ = ["HullScene", "colour_vertices", "hull_depth", "outline_iou", "reconstruct_hull"]
+__all__ = ["colour_vertices", "hull_depth", "hull_results", "outline_iou"]
 
 # Planes along a ray for every voxel that it crosses, and sites that are looked at in one go.
 PLANES_PER_VOXEL, SITES = 1.0, 1 << 24
@@ -38,78 +38,90 @@ BEHIND = 2.0
 SPECK_FACES = 20
 
 
-@dataclass(frozen=True, eq=False)
-class HullScene:
-    """A visual hull and how it looks in every view."""
-
-    views: tuple[Looked, ...]  # depth where a ray first meets the hull, and the photographs' silhouettes
-    ious: tuple[float, ...]  # of the photographs' silhouettes and of the hull's own
-    occupancy: Tensor  # (D, H, W) bool
-    grid: VoxelGrid
-    mesh: Mesh
-
-
-def reconstruct_hull(
+def hull_results(
     scene: PosedImages,
+    view: int | None,
+    title: str,
     *,
-    rule: str = "all",
-    folder: str | os.PathLike[str] | None = None,
-    background: str | Sequence[float] | None = None,
-    resolution: int = 192,
-    size: int = 640,
-    progress: bool = False,
-) -> HullScene:
-    """Carve the visual hull of a scene's silhouettes and colour its surface.
+    rule: str,
+    masks: str | None,
+    background: str | None,
+    resolution: int,
+    size: int,
+) -> Results:
+    """Carve the visual hull of all silhouettes and colour its surface.
 
     Args:
-        scene: posed photographs, see `lsmgeo.data.open`.
+        scene: posed photographs.
+        view: the one from which the model is looked at first.
+        title: of what is written.
         rule: "all", a solid that lies in every silhouette; or "mean", in three quarters of them, which forgives wrong
             silhouettes; see `lsmgeo.classical.visual_hull`.
-        folder: of mask files, see `lsmgeo.classical.silhouettes`.
-        background: the colour behind the object, see `lsmgeo.classical.silhouettes`.
+        masks: folder of mask files, see `lsmgeo.classical.silhouettes`.
+        background: behind the object: "black", "white", or three numbers from 0 to 1 with commas between.
         resolution: voxels along the longest side of the hull's box.
         size: longer side of the silhouettes in pixels; never larger than the photographs.
-        progress: whether to show a progress bar, one step a view.
 
     Returns:
-        `HullScene`.
+        `Results`; depth is where a ray first meets the hull, certain are the photographs' silhouettes.
 
     Raises:
         OptionError: no silhouettes are there, one is empty, or nothing projects into all of them.
         DataError: a photograph or a mask cannot be read.
     """
-    who = "reconstruct_hull"
+    who = "reconstruct"
     check_choice(who, "rule", rule, RULES)
     check_whole(who, "resolution", resolution, 8, 1024)
     check_whole(who, "size", size, 16)
-    found = silhouettes(scene, folder=folder, background=background)
-    for view, mask in enumerate(found):
+    try:
+        found = silhouettes(scene, folder=masks, background=named_colour(background))
+    except OptionError as error:
+        if "no alpha" not in str(error):
+            raise
+        raise OptionError(f"{error}: --masks FOLDER, or --background white, black or R,G,B") from None
+    for number, mask in enumerate(found):
         if not bool(mask.any()):
-            raise OptionError(f"{who}: the silhouette of view {view} ({scene.names[view]}) is empty")
+            raise OptionError(f"{who}: the silhouette of view {number} ({scene.names[number]}) is empty")
     shape = fitted(scene.size(0), size)
-    cameras = stack([resize(scene.camera(view), *shape) for view in range(len(scene))])
-    masks = torch.stack([resized(mask[None].float(), shape)[0] > 0.5 for mask in found])
-    grid = default_grid(masks, cameras, resolution)
-    border = masks.clone()
+    cameras = stack([resize(scene.camera(number), *shape) for number in range(len(scene))])
+    outlines = torch.stack([resized(mask[None].float(), shape)[0] > 0.5 for mask in found])
+    grid = default_grid(outlines, cameras, resolution)
+    border = outlines.clone()
     border[:, 1:-1, 1:-1] = False
     # An object that is cut off by a picture's border goes on beyond it.
     outside = "unknown" if bool(border.any()) else "empty"
-    soft = torch.stack([signed_distance(mask) for mask in masks]) if rule == "all" else masks.float()
+    soft = torch.stack([signed_distance(mask) for mask in outlines]) if rule == "all" else outlines.float()
     level = {"all": 0.0, "mean": 0.75}[rule]
     hull = visual_hull(soft, cameras, grid, rule=rule, threshold=level, outside=outside)
     if not bool(hull.occupancy.any()):
         raise OptionError(f"{who}: no voxel lies in the silhouettes; rule='mean' forgives wrong ones")
     looked, ious = [], []
-    with tqdm(masks, desc="hull", unit="view", disable=None if progress else True) as bar:
-        for view, mask in enumerate(bar):
-            camera, image = select(cameras, 0, view), resized(scene.load(view), shape)
-            depth = hull_depth(hull.occupancy, grid, camera)
-            ious.append(outline_iou(depth, mask))
-            numbers = (("IoU of silhouette and hull", f"{ious[-1]:.3f}"),)
-            looked.append(Looked(view, image, camera, depth, mask.float(), "silhouette", numbers))
+    for number, mask in enumerate(tqdm(outlines, desc="hull", unit="view", disable=None)):
+        camera, image = select(cameras, 0, number), resized(scene.load(number), shape)
+        depth = hull_depth(hull.occupancy, grid, camera)
+        ious.append(outline_iou(depth, mask))
+        numbers = (("IoU of silhouette and hull", f"{ious[-1]:.3f}"),)
+        looked.append(Looked(number, image, camera, depth, mask.float(), "silhouette", numbers))
     mesh = drop_specks(extract_mesh(hull.support, grid, level=level), SPECK_FACES)
     mesh = colour_vertices(mesh, looked, BEHIND * voxel_side(grid))
-    return HullScene(tuple(looked), tuple(ious), hull.occupancy, grid, mesh)
+    z, y, x = hull.occupancy.shape
+    volume = 100 * float(hull.occupancy.float().mean())
+    facts = (
+        ("scene", f"{len(scene)} photographs, {scene.source}"),
+        ("hull", f"of {len(ious)} silhouettes, {x} x {y} x {z} voxels (x, y, z), {volume:.1f} % inside"),
+        ("silhouettes", f"IoU with the hull's own {np.mean(ious):.3f} on average, {min(ious):.3f} at least"),
+        *mesh_facts(mesh),
+    )
+    notes: tuple[str, ...] = ()
+    worst = int(np.argmin(ious))
+    if ious[worst] < 0.8:
+        notes = (
+            f"The silhouette of {scene.names[worst]} and the hull have an IoU of {ious[worst]:.2f} alone. Where the "
+            "silhouette holds more than the object, that is background, and harmless; where the hull lacks a piece of "
+            "it, another silhouette or a camera is wrong, which --rule mean forgives.",
+        )
+    looked.sort(key=lambda one: view is not None and one.view != view)
+    return Results(title, facts, notes, tuple(looked), mesh=mesh)
 
 
 def outline_iou(depth: Tensor, mask: Tensor) -> float:
@@ -190,8 +202,7 @@ def colour_vertices(mesh: Mesh, views: Sequence[Looked], behind: float) -> Mesh:
             view.depth[None, None, None], cameras, points, mode="nearest", augment=("depth",)
         )
         known, z = depth[0, 0]
-        E = view.camera.cam_from_world.double().numpy()
-        rays = -E[:3, :3].T @ E[:3, 3] - mesh.vertices
+        rays = camera_centers(cameras) - mesh.vertices
         cosine = (rays * normals).sum(1) / np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
         seen = visible[0, 0] & (known > 0) & (z < known + behind)
         # Never nothing, so that what is seen at a grazing angle alone has a colour too.

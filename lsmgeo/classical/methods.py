@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from lsmgeo._checks import check_whole
-from lsmgeo.classical.hull_scene import reconstruct_hull
 from lsmgeo.classical.outputs import Looked, Results
 from lsmgeo.classical.reconstruct import Reconstruction, reconstruct_scene, reconstruct_view, surface_of
 from lsmgeo.classical.views import default_depth_range, select_neighbours
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
     from lsmgeo.data.meshes import Mesh
 
-__all__ = ["hull_results", "mesh_facts", "named_colour", "readable", "sweep_results"]
+__all__ = ["mesh_facts", "named_colour", "readable", "sweep_results"]
 
 MOST_NAMED = 5
 # Kept pixels below this fraction are worth a word.
@@ -148,64 +147,6 @@ def sweep_results(
     return Results(title, tuple(facts), notes, tuple(map(_looked, views)), points, colours, mesh, used)
 
 
-def hull_results(
-    scene: PosedImages,
-    view: int | None,
-    title: str,
-    *,
-    rule: str,
-    masks: str | None,
-    background: str | None,
-    resolution: int,
-    size: int,
-) -> Results:
-    """The visual hull of all silhouettes.
-
-    Args:
-        scene: posed photographs.
-        view: the one from which the model is looked at first.
-        title: of what is written.
-        rule: see `lsmgeo.classical.reconstruct_hull`, like all further options.
-        masks: folder of mask files.
-        background: "black", "white", or three numbers from 0 to 1 with commas between.
-        resolution: voxels along the longest side.
-        size: longer side of the silhouettes.
-
-    Raises:
-        OptionError: no silhouettes are there, or they have no hull.
-        DataError: a photograph or a mask cannot be read.
-    """
-    colour = named_colour(background)
-    try:
-        hull = reconstruct_hull(
-            scene, rule=rule, folder=masks, background=colour, resolution=resolution, size=size, progress=True
-        )
-    except OptionError as error:
-        if "no alpha" not in str(error):
-            raise
-        raise OptionError(f"{error}: --masks FOLDER, or --background white, black or R,G,B") from None
-    ious = hull.ious
-    depth, height, width = hull.occupancy.shape
-    volume = 100 * float(hull.occupancy.float().mean())
-    facts = [
-        ("scene", f"{len(scene)} photographs, {scene.source}"),
-        ("hull", f"of {len(ious)} silhouettes, {width} x {height} x {depth} voxels (x, y, z), {volume:.1f} % inside"),
-        ("silhouettes", f"IoU with the hull's own {np.mean(ious):.3f} on average, {min(ious):.3f} at least"),
-        *mesh_facts(hull.mesh),
-    ]
-    notes = []
-    worst = int(np.argmin(ious))
-    if ious[worst] < 0.8:
-        name = scene.names[worst]
-        notes.append(
-            f"The silhouette of {name} and the hull have an IoU of {ious[worst]:.2f} alone. Where the silhouette holds "
-            "more than the object, that is background, and harmless; where the hull lacks a piece of it, another "
-            "silhouette or a camera is wrong, which --rule mean forgives."
-        )
-    ordered = sorted(hull.views, key=lambda one: one.view != view) if view is not None else hull.views
-    return Results(title, tuple(facts), tuple(notes), tuple(ordered), mesh=hull.mesh)
-
-
 def named_colour(background: str | None) -> str | tuple[float, ...] | None:
     """A colour as `lsmgeo.classical.silhouettes` takes it, of a name or of three numbers with commas between."""
     if background is None or "," not in background:
@@ -227,11 +168,11 @@ def _checked_view(scene: PosedImages, view: int, check: int, options: dict[str, 
     """One view, with the pixels kept with which its best neighbours agree that can be swept themselves."""
     if check < 0:
         raise OptionError(f"check must be 0 or more; got {check}")
-    if check == 0 or len(scene) < 2:
-        return reconstruct_view(scene, view, progress=True, **options)
-    able, _ = _able(scene, options, only=view)
-    near, far = options.get("near"), options.get("far")
-    others = [other for other in select_neighbours(scene, view, check, near=near, far=far) if other in able]
+    others = []
+    if check and len(scene) > 1:
+        able, _ = _able(scene, options, only=view)
+        near, far = options["near"], options["far"]
+        others = [other for other in select_neighbours(scene, view, check, near=near, far=far) if other in able]
     if not others:
         return reconstruct_view(scene, view, progress=True, **options)
     swept = reconstruct_scene(scene, [view, *others], min_support=len(others), mesh=False, progress=True, **options)
@@ -241,11 +182,11 @@ def _checked_view(scene: PosedImages, view: int, check: int, options: dict[str, 
 def _able(scene: PosedImages, options: dict[str, Any], *, only: int | None = None) -> tuple[list[int], tuple[str, ...]]:
     """The views that have a depth range and neighbours, and a note on the others; one may have to be among them."""
     able, reasons = [], []
-    stated = [value for value in (options.get("near"), options.get("far")) if value is not None]
+    stated = [value for value in (options["near"], options["far"]) if value is not None]
     if not all(0 < value < float("inf") for value in stated):
         raise OptionError(f"near and far must be positive and finite; got {' and '.join(map(str, stated))}")
     for view in range(len(scene)):
-        near, far = options.get("near"), options.get("far")
+        near, far = options["near"], options["far"]
         try:
             if near is None or far is None:
                 lower, upper = default_depth_range(scene, view)

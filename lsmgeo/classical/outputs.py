@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple
@@ -12,7 +11,7 @@ import numpy as np
 from lsmgeo.classical import pictures
 from lsmgeo.classical.report_page import make_page
 from lsmgeo.classical.surface import write_mesh
-from lsmgeo.data.cameras_json import FORMAT, NAME, VERSION
+from lsmgeo.data.cameras_json import NAME, state_camera, state_cameras
 from lsmgeo.data.files import refusing, write_atomic, write_point_cloud
 from lsmgeo.data.images import encode_png
 from lsmgeo.drawing import as_pixels
@@ -81,7 +80,6 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
     entries = []
     for one, name in zip(results.views, names, strict=True):
         step = max(float(one.depth.max()), 1e-30) / STEPS
-        height, width = one.depth.shape
         steps = (one.depth.double() / step).round().numpy().astype(np.uint16)
         for kind, pixels in (
             ("images", as_pixels(one.image)),
@@ -89,19 +87,8 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
             ("pictures", pictures.coloured_depth(one.depth)),
         ):
             contents[f"{kind}/{name}.png"] = encode_png(pixels)
-        entries.append(
-            {
-                "file": f"images/{name}.png",
-                "photograph": scene.names[one.view],
-                "width": width,
-                "height": height,
-                "K": one.camera.intrinsics.double().tolist(),
-                "cam_from_world": one.camera.cam_from_world.double().tolist(),
-                "depth": f"depth/{name}.png",
-                "depth_step": step,
-            }
-        )
-    stated = {"format": FORMAT, "version": VERSION, "pixel_center": "integer", "cameras": entries}
+        named = {"file": f"images/{name}.png", "photograph": scene.names[one.view]}
+        entries.append(named | state_camera(one.camera) | {"depth": f"depth/{name}.png", "depth_step": step})
     mesh, points, colours = results.mesh, results.points, results.colours
     if not len(points) and mesh is not None and mesh.colours is not None:
         points, colours = mesh.vertices, mesh.colours
@@ -109,15 +96,15 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
     page = make_page(results, scene.names, scene.cameras)
     written = {}
     # What an earlier run left, and this one does not write again, is not of these results.
-    if mesh is not None and len(mesh.faces):
+    has_mesh, has_points = mesh is not None and len(mesh.faces) > 0, len(results.points) > 0
+    for name, is_there in (("model.glb", has_mesh), ("model.ply", has_mesh), ("points.ply", has_points)):
+        if not is_there:
+            with refusing(folder / name, "removed"):
+                (folder / name).unlink(missing_ok=True)
+    if mesh is not None and has_mesh:
         written["mesh"] = write_mesh(folder / "model.glb", mesh)
         write_mesh(folder / "model.ply", mesh)
-    else:
-        _remove(folder / "model.glb")
-        _remove(folder / "model.ply")
-    if not len(results.points):
-        _remove(folder / "points.ply")
-    else:
+    if has_points:
         written["points"] = write_point_cloud(folder / "points.ply", results.points, results.colours)
     written["page"] = write_atomic(folder / "report.html", page.encode())
     written["summary"] = write_atomic(folder / "summary.png", summary)
@@ -126,13 +113,8 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
     written["depth, 16 bit"] = folder / "depth"
     written["depth in colours"] = folder / "pictures"
     # Last, so that it never names what is not there.
-    written["cameras"] = write_atomic(folder / NAME, json.dumps(stated, indent=1, allow_nan=False).encode())
+    written["cameras"] = write_atomic(folder / NAME, state_cameras(entries))
     return written
-
-
-def _remove(path: Path) -> None:
-    with refusing(path, "removed"):
-        path.unlink(missing_ok=True)
 
 
 def file_names(names: Sequence[str]) -> list[str]:
@@ -145,11 +127,8 @@ def file_names(names: Sequence[str]) -> list[str]:
     taken: set[str] = set()
     made = []
     for name in names:
-        parts = (
-            [part for part in PurePosixPath(name.replace("\\", "/")).with_suffix("").parts if part != ".."]
-            if name
-            else []
-        )
+        path = PurePosixPath(name.replace("\\", "/"))
+        parts = [part for part in path.with_suffix("").parts if part != ".."] if name else []
         plain = re.sub(r"[^\w.-]+", "_", "_".join(parts)).strip("._-")[:LONGEST_NAME] or "view"
         unique, number = plain, 1
         # Some systems do not tell capitals from small letters.

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lsmgeo._checks import describe
+from lsmgeo.cameras import CameraTensors
 from lsmgeo.data.depth_files import DepthPng
 from lsmgeo.data.files import child, refuse_unreadable
 from lsmgeo.data.images import has_alpha, image_size
@@ -15,7 +18,7 @@ from lsmgeo.data.json_files import peek_json, read_json, take_array, take_number
 from lsmgeo.data.posed import PosedImages, assemble, check_camera, check_last_row, check_picture, make_cameras
 from lsmgeo.errors import DataError
 
-__all__ = ["FORMAT", "NAME", "VERSION", "is_cameras_json", "read_cameras_json"]
+__all__ = ["NAME", "is_cameras_json", "read_cameras_json", "state_camera", "state_cameras"]
 
 NAME = "cameras.json"
 FORMAT = "lsmgeo cameras"
@@ -134,3 +137,15 @@ def _pose(entry: dict[str, Any], file: Path, where: str) -> np.ndarray:
     pose = take_array(entry, "cam_from_world", (4, 4), file, where)
     check_last_row(pose, file, f"{where}: cam_from_world")
     return pose[:3]
+
+
+def state_camera(camera: CameraTensors) -> dict[str, Any]:
+    """What a file says of one camera, leading shape (); nothing is rounded."""
+    K, E = (part.double().tolist() for part in camera[:2])
+    return {"width": int(camera.width), "height": int(camera.height), "K": K, "cam_from_world": E}
+
+
+def state_cameras(entries: Sequence[Mapping[str, Any]]) -> bytes:
+    """The content of a file of cameras, whose pixel centres are integer."""
+    values = {"format": FORMAT, "version": VERSION, "pixel_center": "integer", "cameras": entries}
+    return json.dumps(values, indent=1, allow_nan=False).encode()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from lsmgeo.cameras import to_colmap, to_opengl
-from lsmgeo.data.cameras_json import FORMAT, NAME, VERSION
+from lsmgeo.data.cameras_json import NAME, state_camera, state_cameras
 from lsmgeo.data.files import atomic_folder, child, read_bytes, write_atomic
 from lsmgeo.data.images import MAX_IMAGE_BYTES, SUFFIXES, encode_png, image_size, read_cut_out, read_image
 from lsmgeo.data.posed import check_picture
@@ -107,7 +107,7 @@ def write_transforms(images: PosedImages, folder: str | PathLike[str]) -> Path:
     values["frames"] = frames
     with atomic_folder(folder) as made:
         _write_pictures(images, names, made / PICTURES)
-        _write_json(made / "transforms.json", values)
+        write_atomic(made / "transforms.json", json.dumps(values, indent=1, allow_nan=False).encode())
     return Path(folder)
 
 
@@ -134,19 +134,12 @@ def write_cameras_json(images: PosedImages, path: str | PathLike[str]) -> Path:
     path = Path(path)
     alone = path.suffix.lower() == ".json"
     names = _below(images, path.parent) if alone else [f"{PICTURES}/{name}" for name in _file_names(images)]
-    K, E = images.cameras.intrinsics.numpy(), images.cameras.cam_from_world.numpy()
-    cameras = []
-    for view, name in enumerate(names):
-        height, width = images.size(view)
-        camera = {"file": name, "width": width, "height": height}
-        cameras.append(camera | {"K": K[view].tolist(), "cam_from_world": E[view].tolist()})
-    values = {"format": FORMAT, "version": VERSION, "pixel_center": "integer", "cameras": cameras}
+    cameras = [{"file": name} | state_camera(images.camera(view)) for view, name in enumerate(names)]
     if alone:
-        _write_json(path, values)
-        return path
+        return write_atomic(path, state_cameras(cameras))
     with atomic_folder(path) as made:
         _write_pictures(images, names, made)
-        _write_json(made / NAME, values)
+        write_atomic(made / NAME, state_cameras(cameras))
     return path
 
 
@@ -195,10 +188,6 @@ def _write_pictures(images: PosedImages, names: list[str], folder: Path) -> None
             content = encode_png(lens.straighten(pixels))
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(child(folder, name, source), content)
-
-
-def _write_json(path: Path, values: dict[str, Any]) -> None:
-    write_atomic(path, json.dumps(values, indent=1, allow_nan=False).encode())
 
 
 def _refuse_skew(who: str, what: str, images: PosedImages) -> None:

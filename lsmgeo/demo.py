@@ -17,8 +17,9 @@ import torch
 from torch import Tensor
 
 from lsmgeo import PlaneSweepProject, Unproject, VoxelGrid, depth_planes, scenes
-from lsmgeo.cameras import CameraTensors, orbit, rays, stack
-from lsmgeo.functional import unproject_points
+from lsmgeo.cameras import CameraTensors, orbit, rays, select, stack
+from lsmgeo.classical.reconstruct import points_of
+from lsmgeo.classical.views import project
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -89,9 +90,7 @@ def _picture(
     batch = stack([cameras])
     dark = scenes.Lights(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(3))
     depth = scenes.render([scene], batch, dark, dtype=torch.float64).depth[0]
-    origins, directions = rays(cameras)
-    along = (directions * cameras.cam_from_world[:, None, None, 2, :3]).sum(-1)  # camera z of a unit step
-    points = origins[:, None, None] + directions * (depth / along)[..., None]
+    points = torch.stack([points_of(one, select(cameras, 0, view)) for view, one in enumerate(depth)])
     hit = (depth > 0) & ((points >= lower) & (points <= upper)).all(-1)
     # Noise, different in every view: a plain background would agree with itself in empty space.
     noise = torch.rand(points.shape[:-1], generator=torch.Generator().manual_seed(0), dtype=points.dtype)
@@ -104,9 +103,7 @@ def _seen_by(points: Tensor, cameras: CameraTensors, scene: scenes.Scene) -> Ten
     origins = rays(cameras)[0][:, None]  # (V, 1, 3)
     towards = points.reshape(1, -1, 3) - origins  # (V, H * W, 3)
     first = scenes.trace([scene], origins.expand_as(towards).reshape(1, -1, 3), towards.reshape(1, -1, 3)).distance
-    nothing = points.new_zeros(1, len(origins), 0, *points.shape[:2])  # the pictures without a channel
-    batch = stack([cameras])
-    inside = unproject_points(nothing, batch, points.reshape(1, -1, 3)).visible[0]
+    inside = torch.from_numpy(project(cameras, points.reshape(-1, 3).numpy())[2])
     return (inside & (first.view(inside.shape) > 1 - 1e-3)).sum(0).view(points.shape[:2])
 
 
@@ -140,7 +137,7 @@ def run_demo(*, size: tuple[int, int] = (120, 160), voxels: int = 72, planes: in
     enough = visible.sum(1, keepdim=True) >= 3
     agreement = torch.where(enough, torch.exp(-variance.sum(1, keepdim=True) / TOLERANCE), 0.0)
 
-    reference = CameraTensors(*(torch.as_tensor(value)[None, view : view + 1] for value in cameras))
+    reference = stack([stack([select(cameras, 0, view)])])
     sweep_depths = depth_planes(1.4, 3.4, planes)
     swept = PlaneSweepProject(grid, sweep_depths, size)(agreement, reference).maps[0, 0]  # (P, H, W)
     depth = _peak(swept, sweep_depths)
@@ -190,10 +187,7 @@ def write_picture(result: DemoResult, path: Path) -> Path:
     shown = torch.where(result.true_depth > 0, result.true_depth, torch.nan)
     found = torch.where(result.error.isfinite() & (result.depth > 0), result.depth, torch.nan)
     low, high = float(shown[shown.isfinite()].min()), float(shown[shown.isfinite()].max())
-    for axes, values, title in (
-        (truth, shown, "true depth (ray traced)"),
-        (depth, found, "recovered depth"),
-    ):
+    for axes, values, title in ((truth, shown, "true depth (ray traced)"), (depth, found, "recovered depth")):
         picture = axes.imshow(values, cmap="viridis", vmin=low, vmax=high)
         axes.set_title(f"{title}, view {result.view}")
         figure.colorbar(picture, ax=axes, location="bottom", label="camera z [world units]")

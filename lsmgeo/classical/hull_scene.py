@@ -18,7 +18,7 @@ from lsmgeo.classical.outputs import Looked, Results
 from lsmgeo.classical.silhouettes import signed_distance, silhouettes
 from lsmgeo.classical.surface import drop_specks, extract_mesh
 from lsmgeo.classical.tsdf import voxel_side
-from lsmgeo.classical.views import camera_centers
+from lsmgeo.classical.views import camera_centers, project
 from lsmgeo.classical.visual_hull import RULES, default_grid, visual_hull
 from lsmgeo.data.meshes import Mesh
 from lsmgeo.errors import OptionError
@@ -147,19 +147,16 @@ def hull_depth(occupancy: Tensor, grid: VoxelGrid, camera: CameraTensors) -> Ten
         return depth
     # The corners of the box of occupied voxels bound their depth, and where they are seen.
     ends = torch.stack([index.amin(0).flip(0) - 0.5, index.amax(0).flip(0) + 0.5]).double()
-    T, E = grid.world_from_lattice.double(), camera.cam_from_world.double()
-    world = torch.cartesian_prod(*ends.unbind(1)) @ T[:3, :3].T + T[:3, 3]
-    corners = world @ E[:3, :3].T + E[:3, 3]
-    z = corners[:, 2]
+    T = grid.world_from_lattice.double()
+    corners = torch.cartesian_prod(*ends.unbind(1)) @ T[:3, :3].T + T[:3, 3]
+    pixels, z = (part[0] for part in project(stack([camera]), corners.numpy())[:2])
     # Of the shortest side, so that flat voxels are not stepped over.
     step = float(T[:3, :3].norm(dim=0).min()) / PLANES_PER_VOXEL
     nearest, farthest = float(z.min()), float(z.max())
     start = max(nearest, step) + step / 2
     top, left, bottom, right = 0, 0, height, width
     if nearest > step:
-        pixels = corners @ camera.intrinsics.double().T
-        pixels = pixels[:, :2] / pixels[:, 2:]
-        (x0, y0), (x1, y1) = pixels.amin(0).floor().long().tolist(), pixels.amax(0).ceil().long().tolist()
+        (x0, y0), (x1, y1) = (end.astype(int).tolist() for end in (np.floor(pixels.min(0)), np.ceil(pixels.max(0))))
         top, left, bottom, right = max(0, y0), max(0, x0), min(height, y1 + 1), min(width, x1 + 1)
     if top >= bottom or left >= right or farthest <= start:
         return depth

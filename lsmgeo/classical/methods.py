@@ -136,12 +136,8 @@ def sweep_results(
         median = np.median([error.median for error in errors])
         count, observed = sum(error.points for error in errors), sum(error.observed for error in errors)
         of_views = "" if len(views) == 1 else ", median of the views'"
-        facts.append(
-            (
-                "depth error",
-                f"median {100 * median:.3f} % of the depth at {count} of {observed} sparse points{of_views}",
-            )
-        )
+        words = f"median {100 * median:.3f} % of the depth at {count} of {observed} sparse points{of_views}"
+        facts.append(("depth error", words))
     facts += mesh_facts(mesh)
     used = tuple({other for one in views for other in one.neighbours})
     return Results(title, tuple(facts), notes, tuple(map(_looked, views)), points, colours, mesh, used)
@@ -203,10 +199,8 @@ def _able(scene: PosedImages, options: dict[str, Any], *, only: int | None = Non
             able.append(view)
     if not able and reasons:
         raise reasons[0][1]
-    if not reasons:
-        return able, ()
     words = _some([f"{scene.names[view]}: {error}" for view, error in reasons])
-    return able, (f"Not swept: {words}",)
+    return able, (f"Not swept: {words}",) if reasons else ()
 
 
 def mesh_facts(mesh: Mesh | None) -> list[tuple[str, str]]:

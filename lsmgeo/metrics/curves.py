@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_choice, check_devices, check_float, check_mask, check_number, describe
-from lsmgeo.errors import DTypeError, OptionError, ShapeError
-from lsmgeo.metrics.depth import middle_of_lowest
+from lsmgeo._checks import check_choice, check_float, check_number, describe
+from lsmgeo.errors import DTypeError, OptionError
+from lsmgeo.metrics.depth import check_alike, middle_of_lowest
 
 __all__ = ["DensityCurve", "RunningDensityCurve", "density_curve"]
 
@@ -148,15 +148,7 @@ def _check_options(
 def _taken(who: str, errors: Tensor, confidence: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
     """Errors and confidences (N,) in float64 of the pixels that count."""
     check_float(who, "errors", errors, "of any shape")
-    check_float(who, "confidence", confidence, "of the shape of errors")
-    if confidence.shape != errors.shape:
-        expected = tuple(errors.shape)
-        raise ShapeError(
-            f"{who}: confidence must be of the shape of errors = {expected}; got {tuple(confidence.shape)}"
-        )
-    if mask is not None:
-        check_mask(who, "mask", mask, tuple(errors.shape), "of the shape of errors")
-    check_devices(who, errors=errors, confidence=confidence, mask=mask)
+    check_alike(who, "errors", errors, "confidence", confidence, mask)
     if mask is not None:
         errors, confidence = errors[mask], confidence[mask]
     return errors.double().flatten().nan_to_num(torch.inf, torch.inf), confidence.double().flatten().nan_to_num(0.0)

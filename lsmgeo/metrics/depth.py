@@ -234,10 +234,15 @@ def _check_maps(who: str, name: str, predicted: Tensor, true: Tensor, mask: Tens
     check_float(who, "predicted", predicted, "(..., h, w)")
     if predicted.dim() < 2:
         raise ShapeError(f"{who}: predicted must be (..., h, w); got {tuple(predicted.shape)}")
-    check_float(who, name, true, "of the shape of predicted")
-    if true.shape != predicted.shape:
-        expected = tuple(predicted.shape)
-        raise ShapeError(f"{who}: {name} must be of the shape of predicted = {expected}; got {tuple(true.shape)}")
+    check_alike(who, "predicted", predicted, name, true, mask)
+
+
+def check_alike(who: str, name: str, value: Tensor, other_name: str, other: Tensor, mask: Tensor | None) -> None:
+    """Require a floating tensor, and a mask if any, of a first one's shape and on its device."""
+    check_float(who, other_name, other, f"of the shape of {name}")
+    shape = tuple(value.shape)
+    if other.shape != shape:
+        raise ShapeError(f"{who}: {other_name} must be of the shape of {name} = {shape}; got {tuple(other.shape)}")
     if mask is not None:
-        check_mask(who, "mask", mask, tuple(predicted.shape), "of the shape of predicted")
-    check_devices(who, predicted=predicted, **{name: true}, mask=mask)
+        check_mask(who, "mask", mask, shape, f"of the shape of {name}")
+    check_devices(who, **{name: value, other_name: other}, mask=mask)

@@ -8,7 +8,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from lsmgeo._checks import is_whole
+from lsmgeo._checks import check_whole
 from lsmgeo.errors import OptionError
 
 __all__ = ["Kind", "Material", "Solid", "box", "cone", "cylinder", "ellipsoid", "half_space", "sphere"]
@@ -59,8 +59,7 @@ class Material:
             if len(values) != 3 or not all(0 <= value <= 1 for value in values):
                 raise OptionError(f"Material: {name} must be three numbers in [0, 1]; got {colour!r:.80}")
             object.__setattr__(self, name, values)
-        if not is_whole(self.seed) or self.seed < 0:
-            raise OptionError(f"Material: seed must be a whole number, 0 at least; got {self.seed!r:.80}")
+        check_whole("Material", "seed", self.seed, 0)
         if self.texture not in TEXTURES:
             raise OptionError(f"Material: texture must be one of {', '.join(TEXTURES)}; got {self.texture!r}")
         if not 0 < self.frequency < float("inf"):

@@ -16,7 +16,7 @@ from lsmgeo.models.evaluation.contenders import Contender, shared
 from lsmgeo.models.evaluation.options import Options
 from lsmgeo.models.evaluation.paper import DEPTH, paper_categories
 from lsmgeo.models.evaluation.plots import sheet
-from lsmgeo.models.evaluation.report import Cell, Report, Row, Table
+from lsmgeo.models.evaluation.report import Report, Row, Table
 from lsmgeo.models.evaluation.scores import Scores, joined
 from lsmgeo.models.evaluation.shapes import Shapes, batches
 
@@ -68,7 +68,7 @@ def report_depth(contenders: Sequence[Contender], shapes: Shapes, views: int, op
     rows = [Row(name, one.category_cells(0, categories)) for name, one in scores.items()]
     known = [name for name in DEPTH if name == SWEEP or name in {one.title for one in contenders}]
     rows += [paper_categories(name, DEPTH[name], categories) for name in known]
-    measures = [Row(name, [*(cells := one.cells())[:5], *map(_percent, cells[5:])]) for name, one in scores.items()]
+    measures = [Row(name, [*one.cells()[:5], *one.cells(100)[5:]]) for name, one in scores.items()]
     return Report(
         "depth",
         [
@@ -112,7 +112,3 @@ def _draw(batch: Batch, place: int, depths: Sequence[Tensor]) -> list[Picture | 
     camera, on = select(select(batch.cameras, 0, place), 0, 0), batch.mask[place, 0]
     surfaces = [torch.where(on, depth[place, 0].float(), 0.0) for depth in (batch.depth, *depths)]
     return [as_pixels(batch.images[place, 0], SIDE), *(draw_depth(one, camera, size=SIDE) for one in surfaces)]
-
-
-def _percent(cell: Cell) -> Cell:
-    return Cell(100 * cell.value, 100 * cell.error)

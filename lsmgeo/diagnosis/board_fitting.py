@@ -1,28 +1,103 @@
-"""Poses of a chessboard, errors of its corners, and calibrations of what was seen of it."""
+"""Corners of a chessboard in its pictures, its poses, errors of its corners, and calibrations of what was seen."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from lsmgeo.data.calibration import CalibratedLens
+from lsmgeo.data.images import read_image
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from lsmgeo.diagnosis.board_corners import Seen
-
 __all__ = [
-    "Pose", "Stereo", "board_errors", "calibrate", "calibrate_stereo", "distortion_at_corners", "find_pairs", "pose_of",
-    "project", "rms", "transfer_errors",
+    "Pose", "Seen", "board_errors", "board_points", "calibrate", "calibrate_stereo", "distortion_at_corners",
+    "find_corners", "find_pairs", "look_at", "pose_of", "project", "rms", "transfer_errors",
 ]  # fmt: skip
 
+# Half the side of the square in which a corner is refined, in pixels: larger ones reach the neighbours of a far board.
+WINDOW = 5
 # Fewer pictures of a board leave a camera undetermined.
 FEWEST = 3
 # How much two ways to the same pose may differ: radians, and parts of the distance of the board.
 ANGLE, SHIFT = 0.02, 0.02
+
+
+class Seen(NamedTuple):
+    """What one camera saw of the board."""
+
+    corners: tuple[np.ndarray | None, ...]  # a picture each, (N, 2) pixels, None where the board was not found
+    size: tuple[int, int]  # (height, width) of the first picture; others are not looked at
+
+    @property
+    def found(self) -> list[np.ndarray]:
+        """The corners of those pictures in which the board was found."""
+        return [corners for corners in self.corners if corners is not None]
+
+
+def board_points(corners: tuple[int, int]) -> np.ndarray:
+    """(N, 3) places of a board's corners in squares, row by row, z = 0."""
+    columns, rows = corners
+    grid = np.mgrid[:columns, :rows].T.reshape(-1, 2)
+    return np.column_stack((grid, np.zeros(len(grid))))
+
+
+def look_at(paths: Sequence[Path], corners: tuple[int, int]) -> Seen:
+    """Find the board in all pictures of one camera.
+
+    Raises:
+        DataError: a picture is damaged.
+    """
+    size, seen = None, []
+    for path in paths:
+        picture = read_image(path)
+        size = size or (picture.shape[0], picture.shape[1])
+        seen.append(find_corners(picture, corners) if picture.shape[:2] == size else None)
+    return Seen(tuple(seen), size or (0, 0))
+
+
+def find_corners(picture: np.ndarray, corners: tuple[int, int]) -> np.ndarray | None:
+    """Find a chessboard's inner corners to a fraction of a pixel.
+
+    The finder may begin at either end of a board. Where the two ends differ in colour, which they do when the numbers
+    of corners along the sides are one even and one odd, the order is made the same in all pictures.
+
+    Args:
+        picture: (H, W, 3) uint8.
+        corners: how many along a row and along a column.
+
+    Returns:
+        (N, 2) float64 pixels, integer centres, row by row; None where the board is not there.
+    """
+    import cv2
+
+    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    try:
+        there, rough = cv2.findChessboardCorners(grey, corners)
+        if not there:
+            return None
+        rough = rough.reshape(-1, 1, 2)
+        grid = rough.reshape(corners[1], corners[0], 2)
+        gaps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
+        window = max(1, min(WINDOW, int(0.4 * min(gaps))))
+        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)
+        fine = cv2.cornerSubPix(grey, rough, (window, window), (-1, -1), stop)
+    except cv2.error:
+        return None
+    places = np.asarray(fine, np.float64).reshape(corners[1], corners[0], 2)
+    first, last = (_grey_within(grey, places[part, part]) for part in (slice(None, 2), slice(-2, None)))
+    if sum(corners) % 2 == 1 and first > last:
+        places = places[::-1, ::-1]
+    return places.reshape(-1, 2)
+
+
+def _grey_within(grey: np.ndarray, cell: np.ndarray) -> float:
+    """The mean grey in the middle of a square, given its four corners."""
+    x, y = np.round(cell.reshape(4, 2).mean(0)).astype(int)
+    return float(grey[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].mean())
 
 
 class Pose(NamedTuple):
@@ -33,19 +108,15 @@ class Pose(NamedTuple):
 
     def applied(self, points: np.ndarray) -> np.ndarray:
         """Points (N, 3) in the other coordinates."""
-        moved: np.ndarray = points @ self.R.T + self.t
-        return moved
+        return np.asarray(points @ self.R.T + self.t)
+
+    def after(self, other: Pose) -> Pose:
+        """The other pose, then this one."""
+        return Pose(self.R @ other.R, self.R @ other.t + self.t)
 
     def inverse(self) -> Pose:
         """The way back."""
         return Pose(self.R.T, -self.R.T @ self.t)
-
-
-class Stereo(NamedTuple):
-    """A stereo calibration: its error in pixels, and how the second camera stands to the first."""
-
-    rms: float
-    rig: Pose
 
 
 def rms(errors: np.ndarray) -> float:
@@ -91,12 +162,8 @@ def project(lens: CalibratedLens, points: np.ndarray) -> np.ndarray:
 
 def board_errors(lens: CalibratedLens, points: np.ndarray, seen: Sequence[np.ndarray]) -> np.ndarray:
     """Distances in pixels of all corners from where the lens sees the board at its best pose."""
-    errors = []
-    for corners in seen:
-        pose = pose_of(lens, points, corners)
-        if pose is not None:
-            errors.append(np.linalg.norm(project(lens, pose.applied(points)) - corners, axis=1))
-    return np.concatenate(errors) if errors else np.zeros(0)
+    same = Pose(np.eye(3), np.zeros(3))
+    return transfer_errors(same, points, (lens, lens), [(corners, corners) for corners in seen])
 
 
 def distortion_at_corners(lens: CalibratedLens, size: tuple[int, int]) -> float:
@@ -129,8 +196,8 @@ def calibrate_stereo(
     lenses: tuple[CalibratedLens, CalibratedLens],
     pairs: Sequence[tuple[np.ndarray, np.ndarray]],
     size: tuple[int, int],
-) -> Stereo | None:
-    """How the second camera stands to the first, their lenses held; None where that cannot be told.
+) -> tuple[float, Pose] | None:
+    """The error in pixels, and how the second camera stands to the first, their lenses held; None if it cannot be told.
 
     Args:
         points: (N, 3) of the board.
@@ -144,22 +211,14 @@ def calibrate_stereo(
         return None
     board = [points.astype(np.float32)] * len(pairs)
     first, second = ([pair[side].astype(np.float32)[:, None] for pair in pairs] for side in (0, 1))
-    bent = [np.array(lens.coefficients) for lens in lenses]
+    stereo_calibrate: Any = cv2.stereoCalibrate
+    held = [value for lens in lenses for value in (lens.intrinsics, np.array(lens.coefficients))]
     try:
-        error, *_, R, t, _, _ = cv2.stereoCalibrate(
-            board,
-            first,
-            second,
-            lenses[0].intrinsics,
-            bent[0],
-            lenses[1].intrinsics,
-            bent[1],
-            size[::-1],
-            flags=cv2.CALIB_FIX_INTRINSIC,
-        )
+        found = stereo_calibrate(board, first, second, *held, size[::-1], flags=cv2.CALIB_FIX_INTRINSIC)
     except cv2.error:
         return None
-    return Stereo(float(error), Pose(np.asarray(R), t.ravel())) if np.isfinite(error) else None
+    error, *_, R, t, _, _ = found
+    return (float(error), Pose(np.asarray(R), t.ravel())) if np.isfinite(error) else None
 
 
 def transfer_errors(
@@ -180,7 +239,7 @@ def transfer_errors(
     for first, second in pairs:
         pose = pose_of(lenses[0], points, first)
         if pose is not None:
-            errors.append(np.linalg.norm(project(lenses[1], rig.applied(pose.applied(points))) - second, axis=1))
+            errors.append(np.linalg.norm(project(lenses[1], rig.after(pose).applied(points)) - second, axis=1))
     return np.concatenate(errors) if errors else np.zeros(0)
 
 
@@ -202,7 +261,7 @@ def find_pairs(
         [pose_of(lens, points, corners) for corners in side] for lens, side in zip(lenses, (first, second), strict=True)
     ]
     choices = [
-        (a, b, Pose(second_pose.R @ first_pose.R.T, second_pose.t - second_pose.R @ first_pose.R.T @ first_pose.t))
+        (a, b, second_pose.after(first_pose.inverse()))
         for a, first_pose in enumerate(poses[0]) if first_pose is not None
         for b, second_pose in enumerate(poses[1]) if second_pose is not None
     ]  # fmt: skip

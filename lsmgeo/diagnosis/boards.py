@@ -7,19 +7,22 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.board_corners import Seen, board_points, look_at
 from lsmgeo.diagnosis.board_fitting import (
     Pose,
+    Seen,
     board_errors,
+    board_points,
     calibrate,
     calibrate_stereo,
     distortion_at_corners,
     find_pairs,
+    look_at,
     project,
     rms,
     transfer_errors,
 )
 from lsmgeo.diagnosis.findings import Cause, Check, Findings, Gap
+from lsmgeo.diagnosis.geometry import scaling
 from lsmgeo.diagnosis.report import counted
 
 if TYPE_CHECKING:
@@ -53,10 +56,25 @@ class _Scene(NamedTuple):
     """What the pictures show, and what they say of the cameras by themselves."""
 
     points: np.ndarray  # (N, 3), in squares
+    cameras: tuple[str, ...]  # what each is called
     paths: tuple[tuple[Path, ...], ...]
     seen: tuple[Seen, ...]
     lenses: tuple[CalibratedLens, ...]  # calibrated anew, one a camera; empty where that cannot be done
     errors: tuple[float, ...]  # their rms in pixels
+
+    def error_under(self, lens: CalibratedLens, side: int) -> float:
+        """The rms in pixels of what one camera saw under a lens."""
+        return rms(board_errors(lens, self.points, self.seen[side].found))
+
+    def best_side(self, lens: CalibratedLens) -> int:
+        """The camera whose pictures a lens suits best; the last one where it suits none."""
+        errors = [self.error_under(lens, side) for side in range(len(self.seen))]
+        return min(int(np.nanargmin([*errors, np.inf])), len(errors) - 1)
+
+    def is_right(self, error: float, side: int) -> bool:
+        """Whether a lens is as good as its pictures let one be: a board's pose hides much of what is wrong with K."""
+        anew = self.errors[side] if self.errors else LIMIT
+        return error <= LIMIT and error <= max(DOUBT, DOUBTS * anew)
 
 
 class _Report(NamedTuple):
@@ -66,6 +84,10 @@ class _Report(NamedTuple):
     checks: list[Check]
     causes: list[Cause]
     remarks: list[str]
+
+    def measure(self, name: str, error: float, count: int, of: str = "corners") -> None:
+        """Add a check of an error in pixels."""
+        self.checks.append(Check(name, error, "px", LIMIT, count, of))
 
     def blame(self, name: str, how: str, before: float, after: float, remedy: str, besides: str = "") -> None:
         """Add a mistake whose correction brings an error in pixels down."""
@@ -103,10 +125,12 @@ def examine_calibration(calibration: Calibration, path: Path) -> Findings:
         return _concluded(report, Gap(f"{path} names no picture of a board", remedy))
     scene = _look(calibration, report)
     if not all(seen.found for seen in scene.seen):
+        both = zip(scene.cameras, scene.seen, strict=True)
+        blind = [f"{counted(len(side.corners), 'pictures')} of the {name}" for name, side in both if not side.found]
         remedy = (
             "Look whether the pictures show all of the board, sharp, and whether its count of inner corners is right."
         )
-        return _concluded(report, _unseen(scene, remedy))
+        return _concluded(report, Gap(f"no board was found in {' and '.join(blind)}", remedy))
     pairs = _examine_pictures(scene, report)
     good = _examine_lenses(calibration, scene, report)
     if calibration.rig is not None and pairs:
@@ -115,21 +139,11 @@ def examine_calibration(calibration: Calibration, path: Path) -> Findings:
     return _concluded(report)
 
 
-def _unseen(scene: _Scene, remedy: str) -> Gap:
-    names = ("first camera", "second camera") if len(scene.seen) > 1 else ("camera",)
-    blind = [(name, side) for name, side in zip(names, scene.seen, strict=True) if not side.found]
-    told = " and ".join(f"{counted(len(side.corners), 'pictures')} of the {name}" for name, side in blind)
-    return Gap(f"no board was found in {told}", remedy)
-
-
 def _concluded(report: _Report, gap: Gap | None = None) -> Findings:
     # Of several mistakes the first: pictures come before lenses, and these before rigs, which are measured with them.
     cause = report.causes[0] if report.causes else None
-    others = [
-        f"Also {other.name}: {other.evidence}. {other.remedy}"
-        for other in report.causes[1:]
-        if cause is not None and other.name != cause.name
-    ]
+    further = [other for other in report.causes if cause is not None and other.name != cause.name]
+    others = [f"Also {other.name}: {other.evidence}. {other.remedy}" for other in further]
     return Findings(tuple(report.facts), tuple(report.checks), cause, (*report.remarks, *others), "calibration", gap)
 
 
@@ -165,7 +179,8 @@ def _look(calibration: Calibration, report: _Report) -> _Scene:
     paths = tuple(tuple(side[index] for index in chosen) for side in calibration.pictures)
     seen = tuple(look_at(side, corners) for side in paths)
     points = board_points(corners)
-    for side, what in zip(seen, ("first camera", "second camera") if len(seen) > 1 else ("camera",), strict=True):
+    cameras = ("first camera", "second camera") if len(seen) > 1 else ("camera",)
+    for side, what in zip(seen, cameras, strict=True):
         pictures = counted(len(side.corners), "pictures")
         text = f"board found in {len(side.found)} of {pictures} of {side.size[1]} x {side.size[0]}"
         report.facts.append((what, text))
@@ -174,39 +189,32 @@ def _look(calibration: Calibration, report: _Report) -> _Scene:
     if len(fitted) < len(anew):
         report.remarks.append("Too few pictures of the board for a calibration from scratch.")
         fitted = []
-    return _Scene(points, paths, seen, tuple(lens for _, lens in fitted), tuple(error for error, _ in fitted))
-
-
-def _pairs(scene: _Scene) -> Pairs:
-    if len(scene.seen) < 2:
-        return []
-    both = zip(scene.seen[0].corners, scene.seen[1].corners, strict=True)
-    return [(first, second) for first, second in both if first is not None and second is not None]
+    errors, lenses = tuple(error for error, _ in fitted), tuple(lens for _, lens in fitted)
+    return _Scene(points, cameras, paths, seen, lenses, errors)
 
 
 def _examine_pictures(scene: _Scene, report: _Report) -> Pairs:
     """Calibrate from scratch; the pairs of corners, which are those of the list unless it was shuffled."""
-    names = ("first camera anew", "second camera anew") if len(scene.seen) > 1 else ("calibrated anew",)
-    for name, error, side, lens in zip(names, scene.errors, scene.seen, scene.lenses, strict=False):
-        what = "rms of a calibration from scratch"
-        if len(scene.seen) == 1:
-            report.checks.append(Check(what, error, "px", LIMIT, len(side.found) * len(scene.points), "corners"))
-        report.facts.append((name, f"{_lens_text(lens, side.size)}; rms {error:.3f} px"))
-    pairs = _pairs(scene)
+    alone = len(scene.seen) == 1
+    for name, error, side, lens in zip(scene.cameras, scene.errors, scene.seen, scene.lenses, strict=False):
+        if alone:
+            report.measure("rms of a calibration from scratch", error, len(side.found) * len(scene.points))
+        what = "calibrated anew" if alone else f"{name} anew"
+        report.facts.append((what, f"{_lens_text(lens, side.size)}; rms {error:.3f} px"))
+    both = [] if alone else zip(scene.seen[0].corners, scene.seen[1].corners, strict=True)
+    pairs = [(first, second) for first, second in both if first is not None and second is not None]
     if len(scene.lenses) < 2:
         return pairs
     lenses = scene.lenses[0], scene.lenses[1]
     stereo = calibrate_stereo(scene.points, lenses, pairs, scene.seen[0].size)
     if stereo is None:
         return pairs
-    what = "rms of a stereo calibration from scratch"
-    report.checks.append(Check(what, stereo.rms, "px", LIMIT, 2 * len(pairs) * len(scene.points), "corners"))
-    if stereo.rms <= LIMIT:
-        report.facts.append(("measured baseline", f"{np.linalg.norm(stereo.rig.t):.3f} squares"))
+    error, rig = stereo
+    report.measure("rms of a stereo calibration from scratch", error, 2 * len(pairs) * len(scene.points))
+    if error <= LIMIT:
+        report.facts.append(("measured baseline", f"{np.linalg.norm(rig.t):.3f} squares"))
         return pairs
-    if max(scene.errors) > LIMIT:
-        return []
-    return _pair_anew(scene, stereo.rms, report)
+    return [] if max(scene.errors) > LIMIT else _pair_anew(scene, error, report)
 
 
 def _pair_anew(scene: _Scene, stated: float, report: _Report) -> Pairs:
@@ -217,12 +225,12 @@ def _pair_anew(scene: _Scene, stated: float, report: _Report) -> Pairs:
     stereo = calibrate_stereo(scene.points, lenses, pairs, scene.seen[0].size)
     what = "the rms of a stereo calibration"
     # A few pictures always agree on some rig; half of all do not.
-    if stereo is None or stereo.rms > LIMIT or 2 * len(pairs) < min(map(len, numbers)):
+    if stereo is None or stereo[0] > LIMIT or 2 * len(pairs) < min(map(len, numbers)):
         return []
     told = [(scene.paths[0][numbers[0][a]].name, scene.paths[1][numbers[1][b]].name) for a, b in found]
     some = ", ".join(f"{first} with {second}" for first, second in told[:4])
     remedy = f"List beside each other the pictures that were taken at once: {some}{', ...' if len(told) > 4 else ''}."
-    report.blame(SHUFFLED, f"paired otherwise, {what}", stated, stereo.rms, remedy)
+    report.blame(SHUFFLED, f"paired otherwise, {what}", stated, stereo[0], remedy)
     return pairs
 
 
@@ -239,48 +247,42 @@ def _lens_text(lens: CalibratedLens, size: tuple[int, int]) -> str:
 def _examine_lenses(calibration: Calibration, scene: _Scene, report: _Report) -> dict[int, CalibratedLens]:
     """Compare each stated lens with its pictures; the good ones of a pair, by camera."""
     good: dict[int, CalibratedLens] = {}
-    sides: dict[str, int] = {}
-    off: dict[str, float] = {}
+    off: dict[str, tuple[float, int]] = {}
+    several = len(scene.seen) > 1
     for name, lens in calibration.lenses.items():
-        errors = [rms(board_errors(lens, scene.points, side.found)) for side in scene.seen]
         # A lens of its own file may be of either camera; one of a pair says of which.
-        side = {"first": 0, "second": len(errors) - 1}.get(name, int(np.nanargmin([*errors, np.inf])))
-        side = min(side, len(errors) - 1)
-        sides[name] = side
+        side = {"first": 0, "second": len(scene.seen) - 1}.get(name, scene.best_side(lens))
+        error = scene.error_under(lens, side)
         count = len(scene.seen[side].found) * len(scene.points)
-        of = ("first", "second")[side] + " camera's corners" if len(errors) > 1 else "corners"
-        report.checks.append(Check(f"rms under the lens {name}", errors[side], "px", LIMIT, count, of))
+        report.measure(
+            f"rms under the lens {name}", error, count, f"{scene.cameras[side]}'s corners" if several else "corners"
+        )
         report.facts.append((f"lens {name} on its pictures", _lens_text(lens, scene.seen[side].size)))
-        if _is_right(errors[side], scene, side):
-            good[side] = good.get(side, lens)
+        if scene.is_right(error, side):
+            good.setdefault(side, lens)
         else:
-            off[name] = errors[side]
-    if {"first", "second"} <= set(off) and len(scene.seen) > 1:
-        both = zip(("second", "first"), scene.seen, strict=True)
-        swapped = [rms(board_errors(calibration.lenses[name], scene.points, side.found)) for name, side in both]
-        if all(_is_right(error, scene, side) for side, error in enumerate(swapped)):
-            stated = max(off["first"], off["second"])
+            off[name] = error, side
+    if {"first", "second"} <= set(off) and several:
+        swapped = [scene.error_under(calibration.lenses[name], side) for side, name in enumerate(("second", "first"))]
+        if all(scene.is_right(error, side) for side, error in enumerate(swapped)):
+            stated = max(off["first"][0], off["second"][0])
             report.blame(EXCHANGED, "exchanged, the rms under the lenses", stated, max(swapped), EXCHANGE)
             return good
-    for name, stated in off.items():
-        _explain_lens(name, calibration.lenses[name], stated, scene, sides[name], report)
+    for name, (stated, side) in off.items():
+        _explain_lens(name, calibration.lenses[name], stated, scene, side, report)
     return good
 
 
-def _is_right(error: float, scene: _Scene, side: int) -> bool:
-    """Whether a lens is as good as its pictures let one be: a board's pose hides much of what is wrong with K."""
-    anew = scene.errors[side] if scene.errors else LIMIT
-    return error <= LIMIT and error <= max(DOUBT, DOUBTS * anew)
-
-
 def _explain_lens(name: str, lens: CalibratedLens, stated: float, scene: _Scene, side: int, report: _Report) -> None:
-    seen = scene.seen[side]
     scales = list(SCALES)
     if scene.lenses:
         scales.append(float(scene.lenses[side].intrinsics[0, 0] / lens.intrinsics[0, 0]))
-    resized = [(rms(board_errors(_scaled(lens, scale), scene.points, seen.found)), scale) for scale in scales]
+    resized = [
+        (scene.error_under(replace(lens, intrinsics=scaling(scale, scale) @ lens.intrinsics), side), scale)
+        for scale in scales
+    ]
     error, scale = min(resized, key=lambda pair: np.nan_to_num(pair[0], nan=np.inf))
-    if _is_right(error, scene, side) and error < 0.5 * stated and not 0.95 < scale < 1.05:
+    if scene.is_right(error, side) and error < 0.5 * stated and not 0.95 < scale < 1.05:
         remedy = (
             f"The pictures are {scale:.4g} times as large as those that were calibrated: "
             "scale K by that (c becomes (c + 0.5) s - 0.5), or use pictures of the calibrated size."
@@ -288,7 +290,8 @@ def _explain_lens(name: str, lens: CalibratedLens, stated: float, scene: _Scene,
         how = f"with K times {scale:.4g}, the rms under the lens {name}"
         report.blame("K of another resolution", how, stated, error, remedy)
     elif stated > LIMIT and scene.errors and scene.errors[side] < min(LIMIT, 0.5 * stated):
-        bent, fitted = distortion_at_corners(lens, seen.size), distortion_at_corners(scene.lenses[side], seen.size)
+        size = scene.seen[side].size
+        bent, fitted = distortion_at_corners(lens, size), distortion_at_corners(scene.lenses[side], size)
         besides = f"; distortion in the corners is stated as {bent:.3g} px and measured as {fitted:.3g} px"
         k1, other = lens.coefficients[0], scene.lenses[side].coefficients[0]
         if lens.kind == scene.lenses[side].kind and k1 * other < 0 and min(abs(k1), abs(other)) > LEAST_BENT:
@@ -298,13 +301,6 @@ def _explain_lens(name: str, lens: CalibratedLens, stated: float, scene: _Scene,
         )
         how = f"calibrated anew from the pictures, the rms under the lens {name}"
         report.blame("lens of other pictures", how, stated, scene.errors[side], remedy, besides)
-
-
-def _scaled(lens: CalibratedLens, scale: float) -> CalibratedLens:
-    K = lens.intrinsics.copy()
-    K[:2] *= scale
-    K[:2, 2] += 0.5 * scale - 0.5
-    return replace(lens, intrinsics=K)
 
 
 def _other_poses(pose: Pose) -> list[tuple[str, str, str, Pose]]:
@@ -342,7 +338,7 @@ def _examine_rig(
 
     def measured_with(used: tuple[CalibratedLens, CalibratedLens]) -> float:
         stereo = calibrate_stereo(scene.points, used, pairs, scene.seen[0].size)
-        return float("nan") if stereo is None else float(np.linalg.norm(stereo.rig.t))
+        return float("nan") if stereo is None else float(np.linalg.norm(stereo[1].t))
 
     def error_of(pose: Pose, used: tuple[CalibratedLens, CalibratedLens], measured: float) -> float:
         # The pictures do not tell lengths, so T gets the one that was measured.
@@ -359,7 +355,7 @@ def _examine_rig(
         )
     error = error_of(stated, (first, second), measured)
     what = "corners carried by the rig"
-    report.checks.append(Check(f"rms of {what}", error, "px", LIMIT, len(pairs) * len(scene.points), "corners"))
+    report.measure(f"rms of {what}", error, len(pairs) * len(scene.points))
     if error > LIMIT and {"first", "second"} <= set(calibration.lenses):
         swapped = calibration.lenses["second"], calibration.lenses["first"]
         exchanged = error_of(stated, swapped, measured_with(swapped))
@@ -381,27 +377,24 @@ def _explain_pose(errors: Sequence[float], error: float, what: str, report: _Rep
 
 def _examine_views(calibration: Calibration, scene: _Scene, report: _Report) -> None:
     """Compare stated poses of the board with the pictures, where there are as many of both."""
+    import cv2
+
     board = calibration.board
     for name, lens in calibration.lenses.items():
         if lens.views is None or board is None or board.square is None:
             continue
-        errors = [rms(board_errors(lens, scene.points, side.found)) for side in scene.seen]
-        seen = scene.seen[int(np.nanargmin([*errors, np.inf])) if np.isfinite(errors).any() else 0]
-        rows = seen.found if len(seen.found) == len(lens.views) else []
-        if not rows:
-            count = f"{len(lens.views)} poses of the board, which was found in {len(seen.found)} pictures"
+        found = scene.seen[scene.best_side(lens)].found
+        if len(found) != len(lens.views):
+            count = f"{len(lens.views)} poses of the board, which was found in {len(found)} pictures"
             report.remarks.append(f"The lens {name} states {count}.")
             continue
-        _compare_views(lens, name, scene.points * board.square, rows, report)
+        poses = [Pose(np.asarray(cv2.Rodrigues(view[:3])[0]), view[3:]) for view in lens.views]
+        _compare_views(lens, name, poses, scene.points * board.square, found, report)
 
 
 def _compare_views(
-    lens: CalibratedLens, name: str, points: np.ndarray, rows: Sequence[np.ndarray], report: _Report
+    lens: CalibratedLens, name: str, poses: list[Pose], points: np.ndarray, rows: list[np.ndarray], report: _Report
 ) -> None:
-    import cv2
-
-    views = np.zeros((0, 6)) if lens.views is None else lens.views
-    poses = [Pose(np.asarray(cv2.Rodrigues(view[:3])[0]), view[3:]) for view in views]
 
     def table(change: int | None) -> np.ndarray:
         """(poses, pictures) rms in pixels; a board may be numbered from either end."""
@@ -413,8 +406,7 @@ def _compare_views(
 
     as_is = table(None)
     error = rms(as_is.diagonal())
-    count = len(rows) * len(points)
-    report.checks.append(Check(f"rms under the poses of {name}", error, "px", LIMIT, count, "corners"))
+    report.measure(f"rms under the poses of {name}", error, len(rows) * len(points))
     if error <= LIMIT:
         return
     shuffled = rms(as_is.min(1))

@@ -10,7 +10,7 @@ import torch
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
 
-__all__ = ["Geometry", "Hypothesis", "as_they_are", "fundamental", "homogeneous", "project", "relative"]
+__all__ = ["Geometry", "Hypothesis", "as_they_are", "fundamental", "homogeneous", "project", "relative", "scaling"]
 
 # A baseline below this fraction of the cameras' distance from the origin is rounding.
 NO_BASELINE = 1e-9
@@ -59,6 +59,11 @@ def as_they_are(scene: PosedImages) -> Hypothesis:
     K, E = (np.array(torch.as_tensor(value).double()) for value in scene.cameras[:2])
     geometry = Geometry(K, E[:, :3, :3].copy(), E[:, :3, 3].copy())
     return Hypothesis(geometry, geometry)
+
+
+def scaling(x: float, y: float) -> np.ndarray:
+    """S (3, 3): ``S K`` is for pictures x times as wide and y times as high, see `lsmgeo.cameras.resize`."""
+    return np.array([[x, 0, 0.5 * x - 0.5], [0, y, 0.5 * y - 0.5], [0, 0, 1]])
 
 
 def homogeneous(pixels: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.geometry import Geometry, Hypothesis
+from lsmgeo.diagnosis.geometry import Geometry, Hypothesis, scaling
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -137,17 +137,12 @@ def scaled(asis: Hypothesis, factor: np.ndarray) -> Candidate:
         if np.isclose(factor[0], factor[1], rtol=1e-3)
         else f"{factor[0]:.4g} along x, {factor[1]:.4g} along y"
     )
-    scale = np.diag([*factor, 1.0])
-    scale[:2, 2] = 0.5 * factor - 0.5
-
-    def changed(cameras: Geometry) -> Geometry:
-        return cameras._replace(K=scale @ cameras.K)
-
     remedy = (
         f"K belongs to photographs of another size: multiply fx and cx, fy and cy by {told} "
         "(lsmgeo.cameras.resize keeps the half pixel right), or use the photographs of K's size."
     )
-    return Candidate("K of another resolution", f"with K times {told}", remedy, _both(asis, changed))
+    changed = _both(asis, lambda cameras: cameras._replace(K=scaling(*factor) @ cameras.K))
+    return Candidate("K of another resolution", f"with K times {told}", remedy, changed)
 
 
 def focal_mistakes(asis: Hypothesis, scales: Iterable[float]) -> list[Candidate]:

@@ -11,7 +11,7 @@ from PIL import Image
 
 from lsmgeo import data
 from lsmgeo.data import Board, CalibratedLens, Calibration, Rig
-from lsmgeo.diagnosis.board_corners import board_points, find_corners
+from lsmgeo.diagnosis.board_fitting import board_points, find_corners
 from lsmgeo.diagnosis.boards import examine_calibration
 from lsmgeo.diagnosis.report import report
 

@@ -53,9 +53,9 @@ def info(path: str, out: str = "lsmgeo-info") -> int:
     from lsmgeo import data
     from lsmgeo.data.detect import detect
     from lsmgeo.diagnosis import examine
+    from lsmgeo.diagnosis.findings import report
     from lsmgeo.diagnosis.photographs import examine_photographs
     from lsmgeo.diagnosis.pictures import draw_examination
-    from lsmgeo.diagnosis.report import report
 
     start = time.perf_counter()
     source = Path(path)

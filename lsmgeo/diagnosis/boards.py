@@ -21,9 +21,8 @@ from lsmgeo.diagnosis.board_fitting import (
     rms,
     transfer_errors,
 )
-from lsmgeo.diagnosis.findings import Cause, Check, Findings, Gap
+from lsmgeo.diagnosis.findings import Cause, Check, Findings, Gap, counted
 from lsmgeo.diagnosis.geometry import scaling
-from lsmgeo.diagnosis.report import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

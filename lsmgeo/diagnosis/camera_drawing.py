@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.report import counted
+from lsmgeo.diagnosis.findings import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,13 +50,12 @@ class _View(NamedTuple):
 
 def surface_of(voxels: Voxels) -> Content:
     """The occupied voxels that have an empty neighbour, and the directions in which they are empty."""
+    from scipy.ndimage import binary_erosion
+
     T = voxels.grid.world_from_lattice.double().reshape(-1, 4, 4)[0].numpy()
     occupied = np.pad(voxels.occupancy.numpy().transpose(2, 1, 0).astype(np.float32), 1)
     outwards = -np.stack(list(np.gradient(occupied)), -1)
-    full = np.ones_like(occupied, bool)
-    for axis in range(3):
-        full &= (np.roll(occupied, 1, axis) > 0) & (np.roll(occupied, -1, axis) > 0)
-    index = np.argwhere((occupied > 0) & ~full)
+    index = np.argwhere((occupied > 0) & ~binary_erosion(occupied))
     normals = outwards[tuple(index.T)] @ np.linalg.inv(T[:3, :3])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     cell = float(np.cbrt(abs(np.linalg.det(T[:3, :3]))))

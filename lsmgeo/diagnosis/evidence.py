@@ -7,12 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lsmgeo.diagnosis.epipolar import in_front, sampson_distances
-from lsmgeo.diagnosis.findings import CENTRED, LIMITS, SIDES, Check, pixel_limit
+from lsmgeo.diagnosis.findings import CENTRED, LIMITS, SIDES, Check, pixel_limit, share
+from lsmgeo.diagnosis.geometry import evenly
 from lsmgeo.diagnosis.matching import Matches, grey_picture, match_features
-from lsmgeo.diagnosis.outlines import epipolar_tangency, outline
-from lsmgeo.diagnosis.silhouettes import load_silhouettes, near_cells, occupied_centers, overlap, within_a_cell
-from lsmgeo.diagnosis.sparse import reprojection_errors
+from lsmgeo.diagnosis.residuals import in_front, reprojection_errors, sampson_distances
+from lsmgeo.diagnosis.silhouettes import (
+    epipolar_tangency,
+    load_silhouettes,
+    near_cells,
+    occupied_centers,
+    outline,
+    overlap,
+    within_a_cell,
+)
 from lsmgeo.diagnosis.surfaces import (
     Surfaces,
     load_surfaces,
@@ -55,11 +62,13 @@ class Evidence:
 
     Attributes:
         slow: whether a measurement takes long enough to be spared for hypotheses that are otherwise likely.
+        measurable: whether there is enough to measure.
         everything: what is measured to be reported; None where that is all alike.
         tried: as much of it as it takes to compare hypotheses.
     """
 
     slow = False
+    measurable = True
     everything: Any = None
     tried: Any = None
 
@@ -85,9 +94,7 @@ class Features(Evidence):
         # Whether sides are judged is decided once, so that hypotheses are compared on the same checks.
         known = np.isfinite(in_front(self.matches, cameras)).sum()
         self.judges_sides = bool(known >= LEAST_WITH_PARALLAX)
-
-    def __bool__(self) -> bool:
-        return len(self.matches.pair) > 0
+        self.measurable = len(self.matches.pair) > 0
 
     def _measured(self, hypothesis: Hypothesis, matches: Matches) -> list[Check]:
         distances = np.abs(sampson_distances(matches, hypothesis.photographs))
@@ -95,15 +102,13 @@ class Features(Evidence):
         checks = [Check(name, float(np.median(distances)), "px", self.limit, len(distances), "matches")]
         if len(matches.first) >= LEAST_PAIRS:
             # The median bears a few photographs at wrong cameras; this does not.
-            agree = 100 * float(np.mean(_medians(distances, matches) <= LIMITS["view"] * self.limit))
-            name = "pairs of photographs that agree"
-            checks.append(Check(name, agree, "%", LIMITS["pairs"], len(matches.first), "pairs", at_least=True))
+            agree = np.mean(_medians(distances, matches) <= LIMITS["view"] * self.limit)
+            checks.append(share("pairs of photographs that agree", agree, "pairs", len(matches.first), "pairs"))
         if self.judges_sides:
             front = in_front(matches, hypothesis.photographs)
             front = front[np.isfinite(front)]
             # Cameras in one place have no parallax, and nothing speaks against them.
-            share = 100 * float(front.mean()) if len(front) else 100.0
-            checks.append(Check(SIDES, share, "%", LIMITS["in front"], len(front), "matches", at_least=True))
+            checks.append(share(SIDES, front.mean() if len(front) else 1.0, "in front", len(front), "matches"))
         return checks
 
     def pair_medians(self, hypothesis: Hypothesis) -> np.ndarray:
@@ -123,25 +128,15 @@ class Points(Evidence):
         assert scene.points is not None
         self.points = scene.points
         self.limit = pixel_limit(sizes)
-
-    def __bool__(self) -> bool:
-        return sum(len(observed.points) for observed in self.points.observations) >= LEAST_OBSERVATIONS
+        self.measurable = sum(len(seen.points) for seen in self.points.observations) >= LEAST_OBSERVATIONS
 
     def _measured(self, hypothesis: Hypothesis, _: Any) -> list[Check]:
         """Median reprojection error, and the share of observations with their point in front of the camera."""
         errors, depths, _ = reprojection_errors(self.points, hypothesis.beside)
-        front = 100 * float(np.mean(depths > 0))
-        name = "sparse points in front of their cameras"
+        count, of, error = len(errors), "observations", float(np.median(errors))
         return [
-            Check(
-                "reprojection error of sparse points",
-                float(np.median(errors)),
-                "px",
-                self.limit,
-                len(errors),
-                "observations",
-            ),
-            Check(name, front, "%", LIMITS["in front"], len(errors), "observations", at_least=True),
+            Check("reprojection error of sparse points", error, "px", self.limit, count, of),
+            share("sparse points in front of their cameras", np.mean(depths > 0), "in front", count, of),
         ]
 
 
@@ -153,9 +148,7 @@ class DepthMaps(Evidence):
     def __init__(self, scene: PosedImages, views: np.ndarray) -> None:
         self.surfaces = self.everything = load_surfaces(scene, views)
         self.tried = thinned(self.surfaces, PIXELS_TRIED, VIEWS_TRIED)
-
-    def __bool__(self) -> bool:
-        return len(self.surfaces.views) >= 2
+        self.measurable = len(self.surfaces.views) >= 2
 
     def _measured(self, hypothesis: Hypothesis, surfaces: Surfaces) -> list[Check]:
         errors, _ = relative_errors(surfaces, hypothesis)
@@ -169,9 +162,7 @@ class StereoPair(Evidence):
     def __init__(self, scene: PosedImages) -> None:
         self.surfaces = load_surfaces(scene, np.arange(2))
         self.pictures = tuple(grey_picture(scene, view, max(scene.size(view)))[0] for view in range(2))
-
-    def __bool__(self) -> bool:
-        return len(self.surfaces.views) > 0
+        self.measurable = len(self.surfaces.views) > 0
 
     def _measured(self, hypothesis: Hypothesis, _: Any) -> list[Check]:
         """Median difference in grey levels, against that without a warp."""
@@ -187,23 +178,15 @@ class Outlines(Evidence):
     """Outlines of cut-out photographs: planes through the baseline touch them in both views."""
 
     def __init__(self, scene: PosedImages, views: np.ndarray, sizes: np.ndarray) -> None:
-        found = {}
-        for view in views.tolist():
-            mask = scene.load_mask(view)
-            contour = None if mask is None else outline(mask.numpy())
-            if contour is not None:
-                found[view] = contour
-        self.outlines = found
-        pairs = list(itertools.combinations(sorted(found), 2))
-        chosen = np.linspace(0, len(pairs) - 1, min(len(pairs), OUTLINE_PAIRS)).astype(int)
-        self.pairs = self.everything = [pairs[index] for index in chosen]
-        chosen = np.linspace(0, len(self.pairs) - 1, min(len(pairs), OUTLINE_PAIRS_TRIED)).astype(int)
-        self.tried = [self.pairs[index] for index in chosen]
+        masks = ((view, scene.load_mask(view)) for view in views.tolist())
+        contours = ((view, None if mask is None else outline(mask.numpy())) for view, mask in masks)
+        self.outlines = {view: contour for view, contour in contours if contour is not None}
+        pairs = list(itertools.combinations(sorted(self.outlines), 2))
+        self.pairs = self.everything = [pairs[index] for index in evenly(len(pairs), OUTLINE_PAIRS)]
+        self.tried = [self.pairs[index] for index in evenly(len(self.pairs), OUTLINE_PAIRS_TRIED)]
         self.limit = pixel_limit(sizes)
-
-    def __bool__(self) -> bool:
         # The two tangents of a single pair agree too often by chance.
-        return len(self.pairs) >= LEAST_OUTLINE_PAIRS
+        self.measurable = len(self.pairs) >= LEAST_OUTLINE_PAIRS
 
     def _measured(self, hypothesis: Hypothesis, pairs: list[tuple[int, int]]) -> list[Check]:
         distances = self.distances(hypothesis.photographs, pairs)
@@ -231,29 +214,23 @@ class Solids(Evidence):
         self.near, self.lattice = near_cells(scene.voxels)
         self.solid = occupied_centers(scene.voxels)
         self.silhouettes = load_silhouettes(scene, views) if scene.cut_out else None
-        self.surfaces = load_surfaces(scene, views) if scene.depths is not None else None
-
-    def __bool__(self) -> bool:
-        measurable = self.silhouettes is not None or (self.surfaces is not None and bool(self.surfaces.views))
-        return len(self.solid.centers) > 0 and measurable
+        surfaces = load_surfaces(scene, views) if scene.depths is not None else None
+        self.surfaces = surfaces if surfaces is not None and surfaces.views else None
+        self.measurable = len(self.solid.centers) > 0 and (self.silhouettes or self.surfaces) is not None
 
     def _measured(self, hypothesis: Hypothesis, _: Any) -> list[Check]:
         """Cells inside the outlines, overlap with them, and depth points near occupied cells."""
         checks = []
         if self.silhouettes is not None:
             recalls, unions = overlap(self.silhouettes, self.solid, hypothesis.photographs)
-            cells, views = len(self.solid.centers) * len(recalls), len(unions)
-            name = "voxels inside the outlines"
-            value = 100 * float(recalls.mean())
-            checks.append(Check(name, value, "%", LIMITS["inside"], cells, "voxels", at_least=True))
+            cells = len(self.solid.centers) * len(recalls)
+            checks.append(share("voxels inside the outlines", recalls.mean(), "inside", cells, "voxels"))
             name = "overlap of the voxels with the outlines"
-            value = 100 * float(unions.mean())
-            checks.append(Check(name, value, "%", LIMITS["overlap"], views, "views", at_least=True))
-        if self.surfaces is not None and self.surfaces.views:
+            checks.append(share(name, unions.mean(), "overlap", len(unions), "views"))
+        if self.surfaces is not None:
             points = np.concatenate([surface_points(self.surfaces, hypothesis, view) for view in self.surfaces.views])
-            value = 100 * float(within_a_cell(points, self.near, self.lattice))
-            name = "depth points within a cell of the voxels"
-            checks.append(Check(name, value, "%", LIMITS["near a cell"], len(points), "points", at_least=True))
+            near = within_a_cell(points, self.near, self.lattice)
+            checks.append(share("depth points within a cell of the voxels", near, "near a cell", len(points), "points"))
         return checks
 
 
@@ -262,9 +239,6 @@ class Centres(Evidence):
 
     def __init__(self, sizes: np.ndarray) -> None:
         self.sizes = sizes
-
-    def __bool__(self) -> bool:
-        return True
 
     def _measured(self, hypothesis: Hypothesis, _: Any) -> list[Check]:
         """Largest distance of a principal point from the middle."""
@@ -310,6 +284,6 @@ def gather_evidence(scene: PosedImages, views: np.ndarray, sizes: np.ndarray, as
             candidates.append(DepthMaps(scene, views))
     if scene.voxels is not None:
         candidates.append(Solids(scene, views))
-    found = [evidence for evidence in candidates if evidence]
+    found = [evidence for evidence in candidates if evidence.measurable]
     # A rectified pair's rows stay its rows whatever K is.
     return [*found, Centres(sizes)] if found and is_rectified(asis.photographs) else found

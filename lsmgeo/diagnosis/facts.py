@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lsmgeo.diagnosis.evidence import DepthMaps, Features, Outlines, StereoPair, principal_offsets
-from lsmgeo.diagnosis.findings import LIMITS, Gap
+from lsmgeo.diagnosis.findings import LIMITS, Gap, counted
+from lsmgeo.diagnosis.geometry import evenly
 from lsmgeo.diagnosis.matching import LEAST_VERIFIED, MAX_VIEWS, choose_views, count_features
-from lsmgeo.diagnosis.report import counted
 from lsmgeo.diagnosis.surfaces import relative_errors
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def find_gap(scene: PosedImages) -> Gap:
         remedy = "Add a photograph, with its camera, that sees the same from another place."
         return Gap("the one photograph has no partner to be compared with", remedy)
     views = choose_views(len(scene))
-    looked = views[np.unique(np.linspace(0, len(views) - 1, MOST_COUNTED).astype(int))]
+    looked = views[evenly(len(views), MOST_COUNTED)]
     counts = count_features(scene, looked)
     among = counted(len(scene), "photographs")
     if len(looked) < len(scene):

@@ -1,4 +1,4 @@
-"""What an examination finds: facts, measurements, how far each may go, and the likely mistake."""
+"""What an examination finds: facts, measurements, how far each may go, the likely mistake; and all that in words."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-__all__ = ["CENTRED", "LIMITS", "SIDES", "Cause", "Check", "Findings", "Gap", "badness", "pixel_limit"]
+__all__ = [
+    "CENTRED", "LIMITS", "SIDES", "Cause", "Check", "Findings", "Gap", "badness", "counted", "pixel_limit", "report",
+    "share", "tell",
+]  # fmt: skip
 
 # Good sets stay at a quarter of these or below; the mistakes that people make go beyond by ten times and more.
 LIMITS = {
@@ -27,6 +30,12 @@ LEAST_BADNESS, MOST_BADNESS = 0.02, 1e6
 # A principal point in the very middle is no better than one that lies well.
 CENTRED = "principal point off the middle"
 SIDES = "matched features in front of both cameras"
+VERDICTS = {
+    "photographs": ("cameras and what they saw belong together", "cameras and what they saw do not belong together"),
+    "calibration": ("lenses and pictures of the board agree", "lenses and pictures of the board do not agree"),
+    "voxels": ("the mesh and its voxels agree", "the mesh and its voxels do not agree"),
+}
+BEYOND = 1e8
 
 
 class Check(NamedTuple):
@@ -54,6 +63,11 @@ class Check(NamedTuple):
     def passed(self) -> bool:
         """Whether the value keeps its limit; NaN does not."""
         return self.value >= self.limit if self.at_least else self.value <= self.limit
+
+
+def share(name: str, fraction: float | np.floating, limit: str, measured: int, of: str) -> Check:
+    """The check that a fraction, told in %, does not fall below one of the `LIMITS`."""
+    return Check(name, 100 * float(fraction), "%", LIMITS[limit], measured, of, at_least=True)
 
 
 class Cause(NamedTuple):
@@ -120,3 +134,78 @@ def badness(check: Check) -> float:
     part = (100 - check.value) / (100 - check.limit) if check.at_least else check.value / check.limit
     least = 1.0 if check.name == CENTRED else LEAST_BADNESS
     return float(np.clip(part, least, MOST_BADNESS)) if np.isfinite(part) else MOST_BADNESS
+
+
+def report(findings: Findings) -> str:
+    """Facts, a table of checks, remarks and the verdict, as lines.
+
+    Example:
+        >>> from lsmgeo.diagnosis.findings import Check, Findings, report
+        >>> check = Check("reprojection error of sparse points", 0.25, "px", 1.2, 5931, "observations")
+        >>> print(report(Findings((("photographs", "23, 1000 x 658"),), (check,), None)))
+        photographs:      23, 1000 x 658
+        <BLANKLINE>
+        check                                      measured         limit
+        reprojection error of sparse points         0.25 px  <=   1.2 px  ok      5931 observations
+        <BLANKLINE>
+        verdict:          good: cameras and what they saw belong together
+    """
+    lines = [f"{name + ':':<17} {text}" for name, text in findings.facts]
+    if findings.checks:
+        lines += ["", f"{'check':<42}{'measured':>9}{'limit':>14}", *(_line(check) for check in findings.checks)]
+    lines += ["", *(f"{'remark:':<18}{remark}" for remark in findings.remarks)]
+    return "\n".join([*lines, *(f"{name + ':':<18}{text}" for name, text in _concluded(findings))])
+
+
+def _concluded(findings: Findings) -> list[tuple[str, str]]:
+    cause, gap = findings.cause, findings.gap
+    good, bad = VERDICTS[findings.kind]
+    if cause is not None:
+        return [
+            ("verdict", f"BAD, the likely mistake: {cause.name}"),
+            ("because", cause.evidence),
+            ("remedy", cause.remedy),
+        ]
+    if findings.verdict != "unknown":
+        return [("verdict", f"good: {good}" if findings.verdict == "good" else f"BAD: {bad}")]
+    verdict = ("verdict", "unknown: nothing here could be measured")
+    return [verdict] if gap is None else [verdict, ("because", gap.reason), ("what to do", gap.remedy)]
+
+
+def _line(check: Check) -> str:
+    sign = ">=" if check.at_least else "<="
+    unit = {"grey levels": "grey"}.get(check.unit, check.unit)
+    value, limit = (f"{tell(number)} {unit}".rstrip() for number in (check.value, check.limit))
+    state = "ok" if check.passed else "FAILED"
+    return f"{check.name:<42}{value:>9}  {sign} {limit:>8}  {state:<7} {counted(check.measured, check.of)}".rstrip()
+
+
+def counted(count: int, things: str) -> str:
+    """A number of things, in the singular where there is one.
+
+    Example:
+        >>> from lsmgeo.diagnosis.findings import counted
+        >>> counted(2, "photographs"), counted(1, "photographs"), counted(1, "matches")
+        ('2 photographs', '1 photograph', '1 match')
+    """
+    if count == 1:
+        things = things.removesuffix("es" if things.endswith("ches") else "s")
+    return f"{count} {things}"
+
+
+def tell(value: float) -> str:
+    """A measurement in three digits; what is beyond measure in words.
+
+    Example:
+        >>> from lsmgeo.diagnosis.findings import tell
+        >>> tell(0.16472), tell(99.96), tell(float("inf"))
+        ('0.165', '99.96', 'infinite')
+    """
+    if np.isnan(value):
+        return "unknown"
+    if abs(value) >= BEYOND:
+        return "infinite"
+    # Close to all and all are not the same.
+    if 99 < value < 100:
+        return f"{np.floor(value * 100) / 100:.4g}"
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"

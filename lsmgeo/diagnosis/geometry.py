@@ -10,7 +10,17 @@ import torch
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
 
-__all__ = ["Geometry", "Hypothesis", "as_they_are", "fundamental", "homogeneous", "project", "relative", "scaling"]
+__all__ = [
+    "Geometry",
+    "Hypothesis",
+    "as_they_are",
+    "evenly",
+    "fundamental",
+    "homogeneous",
+    "project",
+    "relative",
+    "scaling",
+]
 
 # A baseline below this fraction of the cameras' distance from the origin is rounding.
 NO_BASELINE = 1e-9
@@ -59,6 +69,11 @@ def as_they_are(scene: PosedImages) -> Hypothesis:
     K, E = (np.array(torch.as_tensor(value).double()) for value in scene.cameras[:2])
     geometry = Geometry(K, E[:, :3, :3].copy(), E[:, :3, 3].copy())
     return Hypothesis(geometry, geometry)
+
+
+def evenly(count: int, most: int) -> np.ndarray:
+    """At most so many of ``count`` indices, evenly chosen: the same ones each time."""
+    return np.linspace(0, count - 1, min(most, count)).astype(int)
 
 
 def scaling(x: float, y: float) -> np.ndarray:

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.epipolar import residuals
 from lsmgeo.diagnosis.evidence import Features, Outlines, Points
-from lsmgeo.diagnosis.sparse import reprojections
+from lsmgeo.diagnosis.residuals import reprojections, residuals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lsmgeo.diagnosis.epipolar import pair_distances
 from lsmgeo.diagnosis.evidence import Features, Outlines, Points, Solids, is_rectified
 from lsmgeo.diagnosis.mistakes import Candidate
-from lsmgeo.diagnosis.silhouettes import draw_solid
-from lsmgeo.diagnosis.sparse import view_costs
+from lsmgeo.diagnosis.residuals import pair_distances, view_costs
+from lsmgeo.diagnosis.silhouettes import draw_solid, intersection_over_union
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -165,7 +164,7 @@ def _overlaps(solids: Solids, cameras: Geometry) -> np.ndarray:
             key = (mask.shape, step)
             if key not in drawn:
                 drawn[key] = draw_solid(solids.solid, cameras, camera, *key)
-            table[row, column] = (drawn[key] & mask).sum() / max(1, (drawn[key] | mask).sum())
+            table[row, column] = intersection_over_union(drawn[key], mask)
     return table
 
 
@@ -216,7 +215,7 @@ def search_order(first: np.ndarray, second: np.ndarray, costs: np.ndarray) -> np
     cheap = np.partition(costs.reshape(len(costs), -1), min(count, costs[0].size - 1), axis=1)[:, : count + 1]
     telling = np.argsort(-(cheap.mean(1) - cheap.min(1)), kind="stable")
     cameras: dict[int, int] = {}
-    for views in _connected(links):
+    for views in _connected(first, second):
         within = np.array([pair for pair in telling.tolist() if first[pair] in views])
         best: dict[int, int] = {}
         lowest = np.inf
@@ -234,18 +233,15 @@ def search_order(first: np.ndarray, second: np.ndarray, costs: np.ndarray) -> np
     return _improved(_completed(cameras, count), first, second, costs)
 
 
-def _connected(links: list[list[tuple[int, np.ndarray]]]) -> list[set[int]]:
+def _connected(first: np.ndarray, second: np.ndarray) -> list[set[int]]:
     """Groups of views that pairs connect, largest first."""
-    groups: list[set[int]] = []
-    for start in range(len(links)):
-        if links[start] and not any(start in group for group in groups):
-            group, edge = {start}, [start]
-            while edge:
-                fresh = {other for other, _ in links[edge.pop()]} - group
-                group |= fresh
-                edge += sorted(fresh)
-            groups.append(group)
-    return sorted(groups, key=len, reverse=True)
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    views = np.union1d(first, second)
+    ends = np.searchsorted(views, first), np.searchsorted(views, second)
+    count, labels = connected_components(coo_array((np.ones(len(first)), ends), (len(views),) * 2), directed=False)
+    return sorted((set(views[labels == label].tolist()) for label in range(count)), key=len, reverse=True)
 
 
 def _grown(

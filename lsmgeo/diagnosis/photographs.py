@@ -1,4 +1,4 @@
-"""Posed photographs examined: measured as they are, then with likely mistakes undone."""
+"""Whatever a path holds, examined; posed photographs are measured as they are, then with likely mistakes undone."""
 
 from __future__ import annotations
 
@@ -6,23 +6,25 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from lsmgeo.data import PosedImages
+from lsmgeo.data.posed import Voxels
 from lsmgeo.diagnosis.evidence import Evidence, Features, Points, gather_evidence
 from lsmgeo.diagnosis.explain import explain, invisible_mistakes, is_suspicious
 from lsmgeo.diagnosis.facts import describe_scene, find_gap, implausibilities
-from lsmgeo.diagnosis.findings import LIMITS, Cause, Check, Findings, badness
+from lsmgeo.diagnosis.findings import LIMITS, Cause, Check, Findings, badness, tell
 from lsmgeo.diagnosis.geometry import Hypothesis, as_they_are
 from lsmgeo.diagnosis.half_pixel import Shift, find_shifts, is_certain, is_half_a_pixel, is_large, nearer_half
 from lsmgeo.diagnosis.matching import choose_views
-from lsmgeo.diagnosis.report import tell
-from lsmgeo.diagnosis.sparse import reprojection_errors
+from lsmgeo.diagnosis.residuals import reprojection_errors
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
+    from typing import Any
 
-    from lsmgeo.data import PosedImages
     from lsmgeo.diagnosis.explain import Explanation
 
-__all__ = ["Examination", "examine_photographs"]
+__all__ = ["Examination", "examine", "examine_photographs"]
 
 # Of the views, at most this fraction may be off for the others to be believed.
 MOST_OFF = 1 / 3
@@ -40,6 +42,30 @@ class Examination(NamedTuple):
     evidence: tuple[Evidence, ...]
     hypothesis: Hypothesis
     views: np.ndarray
+
+
+def examine(content: Any, path: Path) -> Findings:
+    """Say whether cameras, photographs, depth and voxels belong together, and name the likely mistake where not.
+
+    Args:
+        content: what a reader gave: posed photographs, voxels alone, or a calibration.
+        path: where it was read from, for messages.
+
+    Returns:
+        The findings.
+
+    Raises:
+        DataError: a file that is needed is missing or damaged.
+    """
+    if isinstance(content, PosedImages):
+        return examine_photographs(content).findings
+    if isinstance(content, Voxels):
+        from lsmgeo.diagnosis.solids import examine_voxels
+
+        return examine_voxels(content, path)
+    from lsmgeo.diagnosis.boards import examine_calibration
+
+    return examine_calibration(content, path)
 
 
 def examine_photographs(scene: PosedImages) -> Examination:

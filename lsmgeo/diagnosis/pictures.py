@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lsmgeo.diagnosis.camera_drawing import Content, draw_cameras, surface_of
-from lsmgeo.diagnosis.epipolar import sampson_distances
 from lsmgeo.diagnosis.evidence import DepthMaps, Features, Solids, StereoPair
 from lsmgeo.diagnosis.geometry import fundamental, homogeneous
+from lsmgeo.diagnosis.residuals import sampson_distances
 from lsmgeo.diagnosis.silhouettes import draw_solid
 from lsmgeo.diagnosis.surfaces import seen_errors, surface_points, warped
 from lsmgeo.drawing import as_pixels, as_png, new_figure

@@ -1,4 +1,4 @@
-"""Cut-out photographs under cameras: whether the solid projects into its outlines and fills them."""
+"""Cut-out photographs under cameras: whether a solid fills its outlines, and whether these can be of one object."""
 
 from __future__ import annotations
 
@@ -6,22 +6,19 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.geometry import Geometry, project
+from lsmgeo.diagnosis.geometry import Geometry, evenly, homogeneous, project
 
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages, Voxels
 
 __all__ = [
-    "Silhouettes",
-    "Solid",
-    "draw_solid",
-    "load_silhouettes",
-    "near_cells",
-    "occupied_centers",
-    "overlap",
-    "within_a_cell",
-]
+    "Silhouettes", "Solid", "draw_solid", "epipolar_tangency", "intersection_over_union", "load_silhouettes",
+    "near_cells", "occupied_centers", "outline", "overlap", "within_a_cell",
+]  # fmt: skip
 
+# An epipole so near to the outline, seen from the outline's middle, makes planes through the baseline that turn a lot
+# from pixel to pixel.
+LEAST_CLEARANCE = 1.3
 # Cells that are projected, at most; and pixels of the longer side of a mask that they are compared with.
 MAX_CELLS = 1 << 15
 LONGEST_SIDE = 256
@@ -48,8 +45,7 @@ def occupied_centers(voxels: Voxels) -> Solid:
     """The occupied cells; of very many, evenly chosen ones."""
     T = voxels.grid.world_from_lattice.double().reshape(-1, 4, 4)[0].numpy()
     index = np.argwhere(voxels.occupancy.numpy())[:, ::-1]
-    if len(index) > MAX_CELLS:
-        index = index[np.linspace(0, len(index) - 1, MAX_CELLS).astype(int)]
+    index = index[evenly(len(index), MAX_CELLS)]
     centers = index @ T[:3, :3].T + T[:3, 3]
     return Solid(centers, float(np.cbrt(abs(np.linalg.det(T[:3, :3])))))
 
@@ -64,10 +60,9 @@ def load_silhouettes(scene: PosedImages, views: np.ndarray) -> Silhouettes:
     for view in views.tolist():
         mask = scene.load_mask(view)
         assert mask is not None
-        step = int(np.ceil(max(mask.shape) / LONGEST_SIDE))
-        masks.append(mask.numpy()[::step, ::step].copy())
-        steps.append(step)
-    return Silhouettes(tuple(int(view) for view in views), tuple(masks), tuple(steps))
+        steps.append(int(np.ceil(max(mask.shape) / LONGEST_SIDE)))
+        masks.append(mask.numpy()[:: steps[-1], :: steps[-1]].copy())
+    return Silhouettes(tuple(views.tolist()), tuple(masks), tuple(steps))
 
 
 def draw_solid(solid: Solid, geometry: Geometry, camera: int, shape: tuple[int, int], step: int) -> np.ndarray:
@@ -75,15 +70,20 @@ def draw_solid(solid: Solid, geometry: Geometry, camera: int, shape: tuple[int, 
     import cv2
 
     drawn = np.zeros(shape, np.uint8)
-    _, columns, rows, side = _placed(solid, geometry, camera, shape, step)
+    columns, rows, side = _placed(solid, geometry, camera, shape, step)
     drawn[rows, columns] = 1
     return np.asarray(cv2.dilate(drawn, np.ones((side, side), np.uint8)), bool)
 
 
+def intersection_over_union(drawn: np.ndarray, mask: np.ndarray) -> float:
+    """How much of two silhouettes is in both."""
+    return float((drawn & mask).sum() / max(1, (drawn | mask).sum()))
+
+
 def _placed(
     solid: Solid, geometry: Geometry, camera: int, shape: tuple[int, ...], step: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Which cells fall into a picture, the columns and rows of those that do, and a cell's side in its pixels."""
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """The columns and rows of the cells that fall into a picture, and a cell's side in its pixels."""
     height, width = shape
     pixels, depth = project(geometry, camera, solid.centers)
     with np.errstate(invalid="ignore"):
@@ -91,10 +91,10 @@ def _placed(
         inside = (places >= 0).all(1) & (places < [width, height]).all(1) & (depth > 0)
     columns, rows = places[inside].astype(int).T
     if not inside.any():
-        return inside, columns, rows, 1
+        return columns, rows, 1
     focal = np.sqrt(abs(geometry.K[camera, 0, 0] * geometry.K[camera, 1, 1])) / step
     side = int(np.clip(np.ceil(focal * solid.cell / np.median(depth[inside])), 1, max(shape)))
-    return inside, columns, rows, side
+    return columns, rows, side
 
 
 def overlap(silhouettes: Silhouettes, solid: Solid, geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
@@ -107,22 +107,20 @@ def overlap(silhouettes: Silhouettes, solid: Solid, geometry: Geometry) -> tuple
 
     recalls, unions = [], []
     for view, mask, step in zip(*silhouettes, strict=True):
-        inside, columns, rows, side = _placed(solid, geometry, view, mask.shape, step)
+        columns, rows, side = _placed(solid, geometry, view, mask.shape, step)
         reach = 2 * int(np.ceil(HALF_DIAGONAL * side)) + 1
         wide = cv2.dilate(mask.astype(np.uint8), np.ones((reach, reach), np.uint8))
-        recalls.append(float((wide[rows, columns] > 0).sum() / len(inside)))
-        drawn = draw_solid(solid, geometry, view, mask.shape, step)
-        unions.append(float((drawn & mask).sum() / max(1, (drawn | mask).sum())))
+        recalls.append((wide[rows, columns] > 0).sum() / len(solid.centers))
+        unions.append(intersection_over_union(draw_solid(solid, geometry, view, mask.shape, step), mask))
     return np.array(recalls), np.array(unions)
 
 
 def near_cells(voxels: Voxels) -> tuple[np.ndarray, np.ndarray]:
     """Cells that are occupied or touch one that is, two more on each side than there are; and world_from_lattice."""
+    from scipy.ndimage import binary_dilation
+
     T = voxels.grid.world_from_lattice.double().reshape(-1, 4, 4)[0].numpy()
-    near = np.pad(voxels.occupancy.numpy(), MARGIN)
-    for axis in range(3):
-        near = near | np.roll(near, 1, axis) | np.roll(near, -1, axis)
-    return near, T
+    return binary_dilation(np.pad(voxels.occupancy.numpy(), MARGIN), np.ones((3, 3, 3), bool)), T
 
 
 def within_a_cell(points: np.ndarray, near: np.ndarray, world_from_lattice: np.ndarray) -> float:
@@ -132,3 +130,69 @@ def within_a_cell(points: np.ndarray, near: np.ndarray, world_from_lattice: np.n
     inside = (index >= 0).all(1) & (index < np.array(near.shape)).all(1)
     places = np.where(inside[:, None], index, 0).astype(int)
     return float(np.mean(inside & near[tuple(places.T)]))
+
+
+def outline(mask: np.ndarray) -> np.ndarray | None:
+    """The convex hull of the centres of an object's pixels.
+
+    Args:
+        mask: (H, W) bool, True on the object.
+
+    Returns:
+        (N, 2) float64 x, y; None where nothing is there or the object leaves the picture, so that its outline is not
+        all seen.
+    """
+    import cv2
+
+    rows, columns = np.nonzero(mask)
+    if len(rows) == 0 or mask[[0, -1]].any() or mask[:, [0, -1]].any():
+        return None
+    # Through pixels' centres: the half pixel up to the border is there in both views, and moves no plane.
+    return cv2.convexHull(np.stack([columns, rows], 1).astype(np.int32))[:, 0].astype(np.float64)
+
+
+def epipolar_tangency(first: np.ndarray, second: np.ndarray, cameras: Geometry) -> np.ndarray:
+    """How far the two planes through the baseline that touch the object in one view are from touching it in the other.
+
+    A plane through both camera centres that touches the object does so in both views: its two lines are tangents of the
+    outlines. (Cipolla, Astrom, Giblin, "Motion from the frontier of curved surfaces", ICCV 1995; Wong and Cipolla,
+    "Structure and motion from silhouettes", ICCV 2001.)
+
+    Args:
+        first: (N, 2) outline in the first view, pixels.
+        second: (M, 2) outline in the second.
+        cameras: of the two views.
+
+    Returns:
+        (2,) distances in pixels, the mean over the two views; NaN where an epipole lies in or near an outline.
+    """
+    nowhere = np.full(2, np.nan)
+    K, backward, centers = cameras.K, np.linalg.inv(cameras.R), cameras.centers
+    baseline = centers[1] - centers[0]
+    length = np.linalg.norm(baseline)
+    rays = []
+    for points, matrix, turn in zip((first, second), K, backward, strict=True):
+        ray = homogeneous(points) @ np.linalg.inv(matrix).T @ turn.T
+        rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+    if not length > 1e-9 * max(1.0, float(np.linalg.norm(centers, axis=1).max())):
+        return nowhere
+    axis = baseline / length
+    across = [ray - (ray @ axis)[:, None] * axis for ray in rays]  # the part that tells the half-plane
+    middle = across[0].mean(0) / np.linalg.norm(across[0].mean(0))
+    side = np.cross(axis, middle)
+    ends, widths = [], []
+    for part, matrix in zip(across, K, strict=True):
+        angles = np.arctan2(part @ side, part @ middle)
+        # Where the baseline pierces the object, or passes it closely, half-planes go all around.
+        turned = np.exp(1j * angles)
+        centre = np.angle(turned.mean())
+        around = np.angle(turned * np.exp(-1j * centre))
+        if around.max() - around.min() > np.pi / LEAST_CLEARANCE:
+            return nowhere
+        low, high = around.argmin(), around.argmax()
+        ends.append(centre + around[[low, high]])
+        focal = np.sqrt(abs(matrix[0, 0] * matrix[1, 1]))
+        # What an angle about the baseline is in pixels: the nearer to the epipole, the less.
+        widths.append(focal * np.linalg.norm(part[[low, high]], axis=1))
+    difference = np.abs(np.angle(np.exp(1j * (ends[0] - ends[1]))))
+    return np.asarray(difference * (widths[0] + widths[1]) / 2)

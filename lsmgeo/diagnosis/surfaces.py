@@ -6,21 +6,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.geometry import Hypothesis, homogeneous, project
+from lsmgeo.diagnosis.geometry import Hypothesis, evenly, homogeneous, project
 
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
 
 __all__ = [
-    "Surfaces",
-    "load_surfaces",
-    "relative_errors",
-    "seen_errors",
-    "surface_points",
-    "thinned",
-    "warp_errors",
-    "warped",
-]
+    "Surfaces", "load_surfaces", "relative_errors", "seen_errors", "surface_points", "thinned", "warp_errors", "warped",
+]  # fmt: skip
 
 # Pixels of a view that are carried into others, and pixels that are kept of a map.
 SAMPLES = 3000
@@ -71,8 +64,7 @@ def load_surfaces(scene: PosedImages, views: np.ndarray) -> Surfaces:
             continue
         depth = loaded.numpy().astype(np.float64)
         rows, columns = np.nonzero(depth > 0)
-        # Evenly, not at random: the same pixels each time.
-        chosen = np.linspace(0, len(rows) - 1, min(SAMPLES, len(rows))).astype(int)
+        chosen = evenly(len(rows), SAMPLES)
         rows, columns = rows[chosen], columns[chosen]
         pixels[view] = np.stack([columns, rows], 1).astype(np.float64)
         depths[view] = depth[rows, columns]
@@ -83,14 +75,13 @@ def load_surfaces(scene: PosedImages, views: np.ndarray) -> Surfaces:
 
 def thinned(surfaces: Surfaces, most: int, most_views: int) -> Surfaces:
     """The same with at most so many pixels of so many views carried over, evenly chosen, into all the views."""
-    views = np.array(surfaces.views)
-    kept = set(views[np.linspace(0, len(views) - 1, min(most_views, len(views))).astype(int)].tolist())
-    pixels, depths = [], []
-    for view, (each, depth) in enumerate(zip(surfaces.pixels, surfaces.depths, strict=True)):
-        rows = np.linspace(0, len(depth) - 1, min(most, len(depth)) if view in kept else 0).astype(int)
-        pixels.append(each[rows])
-        depths.append(depth[rows])
-    return surfaces._replace(pixels=tuple(pixels), depths=tuple(depths))
+    kept = {surfaces.views[index] for index in evenly(len(surfaces.views), most_views)}
+    rows = [evenly(len(depth), most if view in kept else 0) for view, depth in enumerate(surfaces.depths)]
+    pixels, depths = (
+        tuple(values[chosen] for values, chosen in zip(each, rows, strict=True))
+        for each in (surfaces.pixels, surfaces.depths)
+    )
+    return surfaces._replace(pixels=pixels, depths=depths)
 
 
 def surface_points(surfaces: Surfaces, hypothesis: Hypothesis, view: int) -> np.ndarray:

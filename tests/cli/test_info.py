@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lsmgeo import cli, diagnosis
-from lsmgeo.diagnosis.findings import Check, Findings
-from lsmgeo.diagnosis.report import report
+from lsmgeo import cli
+from lsmgeo.diagnosis.findings import Check, Findings, report
 from tests.data.writers import make_scene, write_colmap, write_middlebury
 from tests.diagnosis.textured import on_an_arc, trace, write
 
@@ -119,4 +118,3 @@ def test_a_report_without_checks_and_cause():
     assert "unknown" in report(Findings((), (), None))
     check = Check("epipolar error of matched features", float("inf"), "px", 1.0, 0, "matches")
     assert "infinite px" in report(Findings((), (check,), None))
-    assert diagnosis.examine.__module__ == "lsmgeo.diagnosis.examination"

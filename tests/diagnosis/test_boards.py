@@ -13,7 +13,7 @@ from lsmgeo import data
 from lsmgeo.data import Board, CalibratedLens, Calibration, Rig
 from lsmgeo.diagnosis.board_fitting import board_points, find_corners
 from lsmgeo.diagnosis.boards import examine_calibration
-from lsmgeo.diagnosis.report import report
+from lsmgeo.diagnosis.findings import report
 
 ROOT = os.environ.get("LSMGEO_TEST_DATA")
 HERE = Path("rig.yml")

@@ -7,14 +7,20 @@ import pytest
 import torch
 
 from lsmgeo.data.posed import Observations, SparsePoints, Voxels
-from lsmgeo.diagnosis.epipolar import in_front, pair_distances, residuals, sampson_distances
 from lsmgeo.diagnosis.findings import Check, badness
 from lsmgeo.diagnosis.geometry import Geometry, Hypothesis
 from lsmgeo.diagnosis.half_pixel import find_shifts
 from lsmgeo.diagnosis.matching import Matches, choose_views
 from lsmgeo.diagnosis.orders import assigned, named_orders, search_order
+from lsmgeo.diagnosis.residuals import (
+    in_front,
+    pair_distances,
+    reprojection_errors,
+    residuals,
+    sampson_distances,
+    view_costs,
+)
 from lsmgeo.diagnosis.silhouettes import Silhouettes, Solid, near_cells, overlap, within_a_cell
-from lsmgeo.diagnosis.sparse import reprojection_errors, view_costs
 from lsmgeo.diagnosis.surfaces import Surfaces, relative_errors
 from lsmgeo.grids import VoxelGrid
 

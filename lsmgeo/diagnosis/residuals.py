@@ -1,4 +1,4 @@
-"""Matched features under cameras: their distance from epipolar lines, and whether what they show lies in front."""
+"""Matched features and sparse points under cameras: distances in pixels, and whether what is seen lies in front."""
 
 from __future__ import annotations
 
@@ -6,15 +6,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lsmgeo.diagnosis.geometry import Geometry, fundamental, homogeneous, relative
+from lsmgeo.diagnosis.geometry import Geometry, fundamental, homogeneous, project, relative
 
 if TYPE_CHECKING:
+    from lsmgeo.data import SparsePoints
     from lsmgeo.diagnosis.matching import Matches
 
-__all__ = ["in_front", "pair_distances", "residuals", "sampson_distances"]
+__all__ = [
+    "in_front", "pair_distances", "reprojection_errors", "reprojections", "residuals", "sampson_distances",
+    "view_costs",
+]  # fmt: skip
 
 # Rays nearer to parallel than this many pixels meet nowhere certain.
 LEAST_PARALLAX = 5.0
+# What is beyond measure, px.
+FARTHEST = 1e9
 
 
 def sampson_distances(matches: Matches, geometry: Geometry) -> np.ndarray:
@@ -37,7 +43,7 @@ def residuals(matches: Matches, geometry: Geometry) -> np.ndarray:
     found = np.stack([sampson_distances(matches, geometry), np.zeros(len(matches.pair))], 1)
     still = np.isfinite(H[:, 0, 0])
     moved = _moved(H[still], matches.pixels[still, 0])
-    found[still] = 0.5 * np.nan_to_num(moved - matches.pixels[still, 1], nan=1e9)
+    found[still] = 0.5 * np.nan_to_num(moved - matches.pixels[still, 1], nan=FARTHEST)
     return found
 
 
@@ -73,7 +79,7 @@ def _distances(pixels: np.ndarray, F: np.ndarray, H: np.ndarray) -> np.ndarray:
         apart = 0.5 * np.linalg.norm(_moved(H, pixels[..., 0, :]) - pixels[..., 1, :], axis=-1)
         distance = np.where(np.isfinite(H[..., 0, 0]), apart, distance)
     # Neither line nor homography says anything of such a match: no camera pair can be worse.
-    return np.nan_to_num(distance, nan=1e9, posinf=1e9, neginf=-1e9)
+    return np.nan_to_num(distance, nan=FARTHEST, posinf=FARTHEST, neginf=-FARTHEST)
 
 
 def in_front(matches: Matches, geometry: Geometry) -> np.ndarray:
@@ -95,3 +101,34 @@ def in_front(matches: Matches, geometry: Geometry) -> np.ndarray:
     known = (determinant > (LEAST_PARALLAX / focal) ** 2 * aa * rr) & (b != 0).any(1)
     front = (ar * rb - ab * rr > 0) & (aa * rb - ar * ab > 0)
     return np.where(known, front, np.nan)
+
+
+def reprojections(points: SparsePoints, geometry: Geometry, view: int, camera: int) -> tuple[np.ndarray, np.ndarray]:
+    """Projection minus observation (M, 2) px and depth (M,) of what one view observes, through one of the cameras."""
+    observed = points.observations[view]
+    pixels, depth = project(geometry, camera, points.positions[observed.points])
+    return np.nan_to_num(pixels - observed.pixels, nan=FARTHEST, posinf=FARTHEST, neginf=-FARTHEST), depth
+
+
+def reprojection_errors(points: SparsePoints, geometry: Geometry) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distances (M,) px, depths (M,), and the view (M,) of every observation."""
+    errors, depths, views = [np.zeros(0)], [np.zeros(0)], [np.zeros(0, int)]
+    for view, observed in enumerate(points.observations):
+        difference, depth = reprojections(points, geometry, view, view)
+        errors.append(np.linalg.norm(difference, axis=1))
+        depths.append(depth)
+        views.append(np.full(len(observed.points), view))
+    return np.concatenate(errors), np.concatenate(depths), np.concatenate(views)
+
+
+def view_costs(points: SparsePoints, geometry: Geometry) -> np.ndarray:
+    """Median distance of each view's observations through each camera, (V, V) px; NaN for a view that observes none."""
+    count = len(points.observations)
+    costs = np.full((count, count), np.nan)
+    for view in range(count):
+        if len(points.observations[view].points):
+            for camera in range(count):
+                difference, depth = reprojections(points, geometry, view, camera)
+                distance = np.where(depth > 0, np.linalg.norm(difference, axis=1), FARTHEST)
+                costs[view, camera] = np.median(distance)
+    return costs

@@ -134,13 +134,11 @@ def pose_of(lens: CalibratedLens, points: np.ndarray, corners: np.ndarray) -> Po
     """
     import cv2
 
-    bent = np.array(lens.coefficients)
+    K, bent = lens.intrinsics, np.array(lens.coefficients)
     try:
         if lens.kind == "fisheye":
-            corners = cv2.fisheye.undistortPoints(corners[:, None], lens.intrinsics, bent)[:, 0]
-            found, turn, t = cv2.solvePnP(points, corners, np.eye(3), np.zeros(4))
-        else:
-            found, turn, t = cv2.solvePnP(points, corners, lens.intrinsics, bent)
+            corners, K, bent = cv2.fisheye.undistortPoints(corners[:, None], K, bent)[:, 0], np.eye(3), np.zeros(4)
+        found, turn, t = cv2.solvePnP(points, corners, K, bent)
     except cv2.error:
         return None
     if not found or not (np.isfinite(turn).all() and np.isfinite(t).all()):
@@ -152,11 +150,9 @@ def project(lens: CalibratedLens, points: np.ndarray) -> np.ndarray:
     """Pixels (N, 2) of points (N, 3) in camera coordinates."""
     import cv2
 
-    bent, still = np.array(lens.coefficients), np.zeros(3)
-    if lens.kind == "fisheye":
-        pixels, _ = cv2.fisheye.projectPoints(points[:, None], still, still, lens.intrinsics, bent)
-    else:
-        pixels, _ = cv2.projectPoints(points, still, still, lens.intrinsics, bent)
+    camera: Any = cv2.fisheye if lens.kind == "fisheye" else cv2
+    still = np.zeros(3)
+    pixels, _ = camera.projectPoints(points[:, None], still, still, lens.intrinsics, np.array(lens.coefficients))
     return np.asarray(pixels).reshape(-1, 2)
 
 

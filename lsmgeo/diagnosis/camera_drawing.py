@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lsmgeo.diagnosis.findings import counted
+from lsmgeo.diagnosis.geometry import homogeneous
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -153,11 +154,8 @@ def _draw_frusta(
     places = [placed[:, :2]]
     for camera, colour in enumerate(colours):
         height, width = sizes[camera]
-        corners = np.array(
-            [[-0.5, -0.5, 1], [width - 0.5, -0.5, 1], [width - 0.5, height - 0.5, 1], [-0.5, height - 0.5, 1]]
-        )
-        rays = np.concatenate([corners, [[(width - 1) / 2, (height - 1) / 2, 1]]])
-        rays = rays @ np.linalg.inv(cameras.K[camera]).T
+        pixels = np.array([[0, 0], [width, 0], [width, height], [0, height], [width / 2, height / 2]]) - 0.5
+        rays = homogeneous(pixels) @ np.linalg.inv(cameras.K[camera]).T
         rays = rays / np.abs(rays[:4, :2]).max() * 0.5 if np.abs(rays[:4, :2]).max() > 0.5 else rays
         ends = ((rays * length) @ np.linalg.inv(cameras.R[camera]).T @ view.system.T)[:, :2]
         start = placed[camera, :2]
@@ -172,13 +170,12 @@ def _draw_frusta(
 
 def _mark(axes: Axes, meeting: np.ndarray | None, view: _View) -> None:
     """The world's origin, and the point where the optical axes meet, where they are in the drawing."""
-    marks = [("+", "origin of the world", np.zeros(3))]
-    marks += [] if meeting is None else [("o", "where the optical axes meet", meeting)]
-    for sign, name, point in marks:
+    marks = [("+", 9, "origin of the world", np.zeros(3))]
+    marks += [] if meeting is None else [("o", 4, "where the optical axes meet", meeting)]
+    for sign, size, name, point in marks:
         x, y, _ = view.placed(point)
         (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
         if left < x < right and low < y < high:
-            size = 9 if sign == "+" else 4
             axes.plot(x, y, sign, color="black", markersize=size, label=name, linestyle="none", zorder=5)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=7, loc="best", framealpha=0.8)
@@ -266,6 +263,5 @@ def _frustum_length(centers: np.ndarray, content: np.ndarray) -> float:
     whole = float(np.linalg.norm(high - low))
     if len(centers) < 2:
         return max(FRUSTUM_OF_ALL * whole, 1e-9) if whole > 0 else 1.0
-    apart = np.linalg.norm(centers[:, None] - centers, axis=2) + np.where(np.eye(len(centers), dtype=bool), np.inf, 0)
-    near = float(np.median(apart.min(1)))
+    near = float(np.median(np.sort(np.linalg.norm(centers[:, None] - centers, axis=2), axis=1)[:, 1]))
     return float(np.clip(FRUSTUM * near, SHORTEST * whole, FRUSTUM_OF_ALL * whole)) or 1.0

@@ -44,6 +44,7 @@ __all__ = [
     "StereoPair",
     "gather_evidence",
     "is_rectified",
+    "pair_medians",
     "principal_offsets",
 ]
 
@@ -102,7 +103,7 @@ class Features(Evidence):
         checks = [Check(name, float(np.median(distances)), "px", self.limit, len(distances), "matches")]
         if len(matches.first) >= LEAST_PAIRS:
             # The median bears a few photographs at wrong cameras; this does not.
-            agree = np.mean(_medians(distances, matches) <= LIMITS["view"] * self.limit)
+            agree = np.mean(pair_medians(distances, matches) <= LIMITS["view"] * self.limit)
             checks.append(share("pairs of photographs that agree", agree, "pairs", len(matches.first), "pairs"))
         if self.judges_sides:
             front = in_front(matches, hypothesis.photographs)
@@ -111,14 +112,12 @@ class Features(Evidence):
             checks.append(share(SIDES, front.mean() if len(front) else 1.0, "in front", len(front), "matches"))
         return checks
 
-    def pair_medians(self, hypothesis: Hypothesis) -> np.ndarray:
-        """Median distance of each pair of views, (P,) px."""
-        return _medians(np.abs(sampson_distances(self.matches, hypothesis.photographs)), self.matches)
 
+def pair_medians(distances: np.ndarray, matches: Matches) -> np.ndarray:
+    """Median distance of each pair of views, (P,) px."""
+    from scipy.ndimage import median
 
-def _medians(distances: np.ndarray, matches: Matches) -> np.ndarray:
-    bounds = np.searchsorted(matches.pair, np.arange(len(matches.first) + 1))
-    return np.array([np.median(distances[a:b]) for a, b in itertools.pairwise(bounds)])
+    return np.asarray(median(distances, matches.pair, np.arange(len(matches.first))))
 
 
 class Points(Evidence):
@@ -151,7 +150,7 @@ class DepthMaps(Evidence):
         self.measurable = len(self.surfaces.views) >= 2
 
     def _measured(self, hypothesis: Hypothesis, surfaces: Surfaces) -> list[Check]:
-        errors, _ = relative_errors(surfaces, hypothesis)
+        errors = relative_errors(surfaces, hypothesis)
         value = 100 * float(np.median(np.abs(errors))) if len(errors) else float("inf")
         return [Check("depth of one view in another", value, "%", LIMITS["depth"], len(errors), "pixels")]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -12,7 +13,8 @@ from lsmgeo.diagnosis.mistakes import (
     Candidate,
     camera_mistakes,
     depth_mistakes,
-    focal_mistakes,
+    depth_scaled,
+    focal_scaled,
     resolution_mistakes,
     scaled,
 )
@@ -123,17 +125,15 @@ def explain(
     tried = tuple(dict.fromkeys(candidate.name for candidate in candidates))
 
     candidates.sort(key=lambda candidate: COMMON.index(candidate.name) if candidate.name in COMMON else len(COMMON))
-    ranks = {id(candidate): rank for rank, candidate in enumerate(candidates)}
     scores = [score(_measured(quick, candidate.hypothesis)) for candidate in candidates]
-    order = np.argsort(scores, kind="stable")
-    finalists = [candidates[index] for index in order[:FINALISTS]]
+    finalists = np.argsort(scores, kind="stable")[:FINALISTS].tolist()
     # What concerns depth alone looks the same to quick evidence.
-    finalists += [candidate for candidate in candidates if candidate.name.startswith("depth")]
+    finalists += [rank for rank, candidate in enumerate(candidates) if candidate.name.startswith("depth")]
     decisive = []
-    for candidate in {id(candidate): candidate for candidate in finalists}.values():
-        after = _measured(evidence, candidate.hypothesis)
+    for rank in dict.fromkeys(finalists):
+        after = _measured(evidence, candidates[rank].hypothesis)
         if is_decisive(before, after):
-            decisive.append((score(after), ranks[id(candidate)], candidate))
+            decisive.append((score(after), rank, candidates[rank]))
     if not decisive:
         return None, tried
     lowest = min(value for value, _, _ in decisive)
@@ -171,9 +171,9 @@ def _measured(evidence: Sequence[Evidence], hypothesis: Hypothesis) -> list[Chec
 def _scales(asis: Hypothesis, quick: Sequence[Evidence], with_depth: Sequence[Evidence]) -> list[Candidate]:
     """Scales of K, of focal lengths and of depth that serve best."""
     found = _refined(SCALES, quick, lambda scale: scaled(asis, np.full(2, scale)))
-    found += _refined(SCALES, quick, lambda scale: focal_mistakes(asis, [scale])[0])
+    found += _refined(SCALES, quick, partial(focal_scaled, asis))
     if with_depth:
-        found += _refined(DEPTH_SCALES, with_depth, lambda scale: depth_mistakes(asis, [scale])[-1])
+        found += _refined(DEPTH_SCALES, with_depth, partial(depth_scaled, asis))
     return found
 
 

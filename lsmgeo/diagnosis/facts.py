@@ -35,16 +35,15 @@ def describe_scene(
     facts = [("format", scene.source), ("photographs", f"{len(scene)}, {_sizes(sizes)}")]
     if len(views) < len(scene):
         facts.append(("looked at", f"{len(views)} of them (at most {MAX_VIEWS}), in runs of successive ones"))
-    focal = np.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], 1)
     angles = field_of_view(cameras, sizes)
-    facts.append(("focal length", f"{_range(focal[:, 0])} x {_range(focal[:, 1])} px"))
+    facts.append(("focal length", f"{_range(cameras.K[:, 0, 0])} x {_range(cameras.K[:, 1, 1])} px"))
     facts.append(("field of view", f"{_range(angles[:, 0])} x {_range(angles[:, 1])} degrees"))
     facts.append(("principal point", f"{_range(cameras.K[:, 0, 2])}, {_range(cameras.K[:, 1, 2])} px"))
     if scene.lenses is not None:
         facts.append(("lenses", f"{sum(lens is not None for lens in scene.lenses)} with distortion, straightened"))
     if len(scene) > 1:
         apart = np.linalg.norm(cameras.centers[:, None] - cameras.centers, axis=2)
-        near = (apart + np.where(np.eye(len(apart), dtype=bool), np.inf, 0)).min(1)
+        near = np.sort(apart, axis=1)[:, 1]
         facts.append(("baselines", f"{np.median(near):.4g} to the nearest (median), {apart.max():.4g} at most"))
     for item in evidence:
         facts += _facts_of(item, asis)
@@ -71,7 +70,7 @@ def _facts_of(item: Evidence, asis: Hypothesis) -> list[tuple[str, str]]:
         low, high = np.percentile(depths, (2, 98))
         text = f"{low:.4g} to {high:.4g} (2nd to 98th percentile)"
         if isinstance(item, DepthMaps):
-            errors, _ = relative_errors(item.surfaces, asis)
+            errors = relative_errors(item.surfaces, asis)
             if len(errors):
                 text += f"; {100 * float(np.mean(np.abs(errors) < 0.02)):.3g} % within 2 % of another view's"
         return [("depth", text)]
@@ -133,20 +132,16 @@ def implausibilities(cameras: Geometry, sizes: np.ndarray) -> list[str]:
 
 def field_of_view(cameras: Geometry, sizes: np.ndarray) -> np.ndarray:
     """(V, 2) degrees across the width and the height."""
-    focal = np.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], 1)
+    focal = cameras.K[:, [0, 1], [0, 1]]
     before = cameras.K[:, :2, 2] + 0.5
     after = sizes[:, ::-1] - before
     return np.asarray(np.degrees(np.arctan2(before, focal) + np.arctan2(after, focal)))
 
 
 def _some(chosen: np.ndarray) -> str:
-    return (
-        "the photograph"
-        if len(chosen) == 1
-        else "all photographs"
-        if chosen.all()
-        else f"{chosen.sum()} of {len(chosen)} photographs"
-    )
+    if len(chosen) == 1:
+        return "the photograph"
+    return "all photographs" if chosen.all() else f"{chosen.sum()} of {len(chosen)} photographs"
 
 
 def _sizes(sizes: np.ndarray) -> str:

@@ -15,6 +15,7 @@ __all__ = [
 LIMITS = {
     "pixels": 0.001,  # of the picture's diagonal: 1 px where that is 1000 px; never below the next
     "fewest pixels": 0.75,  # features and outlines are not located better in small pictures
+    "views": 100.0,  # % of the photographs that agree with the others
     "pairs": 90.0,  # % of the pairs of photographs within three times the limit of pixels
     "in front": 90.0,  # % of the matched features with enough parallax
     "depth": 2.0,  # %, median relative difference of depth

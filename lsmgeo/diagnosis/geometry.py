@@ -11,16 +11,8 @@ if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
 
 __all__ = [
-    "Geometry",
-    "Hypothesis",
-    "as_they_are",
-    "evenly",
-    "fundamental",
-    "homogeneous",
-    "project",
-    "relative",
-    "scaling",
-]
+    "Geometry", "Hypothesis", "as_they_are", "evenly", "fundamental", "homogeneous", "project", "relative", "scaling",
+]  # fmt: skip
 
 # A baseline below this fraction of the cameras' distance from the origin is rounding.
 NO_BASELINE = 1e-9

@@ -11,7 +11,7 @@ from tqdm import tqdm
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
 
-__all__ = ["MAX_VIEWS", "Matches", "choose_views", "count_features", "grey_picture", "match_features"]
+__all__ = ["MAX_VIEWS", "Matches", "choose_views", "count_features", "grey_picture", "match_features", "shrunk"]
 
 # Views that are looked at, at most; beyond, runs of neighbours are taken so that some of them overlap.
 MAX_VIEWS = 40
@@ -34,14 +34,12 @@ class Matches(NamedTuple):
         second: (P,) int.
         pair: (M,) int, which pair a match belongs to, ascending.
         pixels: (M, 2, 2) x, y of the first and of the second photograph, at their own sizes.
-        features: (V,) number of features found in each view, 0 for a view that was not looked at.
     """
 
     first: np.ndarray
     second: np.ndarray
     pair: np.ndarray
     pixels: np.ndarray
-    features: np.ndarray
 
     def thinned(self, most: int) -> Matches:
         """At most so many matches of each pair, evenly chosen."""
@@ -72,17 +70,19 @@ def grey_picture(scene: PosedImages, view: int, longest: int) -> tuple[np.ndarra
     Returns:
         (h, w) uint8, and (2,) the photograph's pixels per pixel of it, x and y.
     """
+    whole = (scene.load(view) * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0).mul_(255).numpy()
+    grey = shrunk(whole, longest)
+    return np.round(grey).clip(0, 255).astype(np.uint8), np.divide(whole.shape, grey.shape)[::-1]
+
+
+def shrunk(picture: np.ndarray, longest: int) -> np.ndarray:
+    """A picture (h, w) or (h, w, 3), smaller where its longer side is beyond ``longest``."""
     import cv2
 
-    image = scene.load(view)
-    grey = (image * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0).mul_(255).numpy()
-    del image
-    height, width = grey.shape
+    height, width = picture.shape[:2]
     shrink = min(1.0, longest / max(height, width))
     size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
-    if size != (width, height):
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    return np.round(grey).clip(0, 255).astype(np.uint8), np.array([width / size[0], height / size[1]])
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA) if size != (width, height) else picture)
 
 
 def match_features(scene: PosedImages, views: np.ndarray) -> Matches:
@@ -108,14 +108,12 @@ def match_features(scene: PosedImages, views: np.ndarray) -> Matches:
         pixels = _verified(found[first], found[second])
         if pixels is not None:
             pairs.append((first, second, pixels))
-    features = np.zeros(len(scene), int)
-    features[views] = [len(found[view].pixels) for view in views.tolist()]
+    first, second = np.array([pair[:2] for pair in pairs], int).reshape(-1, 2).T
     return Matches(
-        np.array([first for first, _, _ in pairs], int),
-        np.array([second for _, second, _ in pairs], int),
+        first,
+        second,
         np.repeat(np.arange(len(pairs)), [len(pixels) for _, _, pixels in pairs]),
         np.concatenate([np.zeros((0, 2, 2)), *(pixels for _, _, pixels in pairs)]),
-        features,
     )
 
 

@@ -11,9 +11,11 @@ import numpy as np
 from lsmgeo.diagnosis.geometry import Geometry, Hypothesis, scaling
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
-__all__ = ["Candidate", "camera_mistakes", "depth_mistakes", "focal_mistakes", "resolution_mistakes", "scaled"]
+__all__ = [
+    "Candidate", "camera_mistakes", "depth_mistakes", "depth_scaled", "focal_scaled", "resolution_mistakes", "scaled",
+]  # fmt: skip
 
 DIRECTIONS = (("right", "left"), ("down", "up"), ("forward", "back"))
 OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -62,7 +64,7 @@ def camera_mistakes(asis: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
             "y flipped",
             "with the cameras' and the world's y negated",
             flipped.format("negate it in the cameras and in the world, which is left-handed here"),
-            lambda cameras: _mirrored(_turned(cameras, FLIP), FLIP),
+            lambda cameras: _turned(cameras._replace(R=cameras.R @ FLIP), FLIP),
         ),
         (
             "y flipped",
@@ -116,7 +118,8 @@ def camera_mistakes(asis: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
     found = [Candidate(*row[:3], _both(asis, row[3])) for row in table]
     for turn, words in _other_axes():
         remedy = f"The cameras' x, y, z axes point {words}: bring them to right, down, forward."
-        turned, both = (_both(asis, partial(change, turn=turn)) for change in (_turned, _inverted_and_turned))
+        turned = _both(asis, partial(_turned, turn=turn))
+        both = _both(asis, lambda cameras, turn=turn: _turned(_inverted(cameras), turn))  # type: ignore[misc]
         found.append(Candidate("other camera axes", f"with axes {words}", remedy, turned))
         found.append(Candidate("other camera axes", f"inverted, with axes {words}", f"{inverse} {remedy}", both))
     return found
@@ -132,11 +135,9 @@ def resolution_mistakes(asis: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
 
 def scaled(asis: Hypothesis, factor: np.ndarray) -> Candidate:
     """All of K multiplied, with half-integer pixel centres, by (2,) factors along x and y."""
-    told = (
-        f"{factor[0]:.4g}"
-        if np.isclose(factor[0], factor[1], rtol=1e-3)
-        else f"{factor[0]:.4g} along x, {factor[1]:.4g} along y"
-    )
+    told = f"{factor[0]:.4g}"
+    if not np.isclose(factor[0], factor[1], rtol=1e-3):
+        told += f" along x, {factor[1]:.4g} along y"
     remedy = (
         f"K belongs to photographs of another size: multiply fx and cx, fy and cy by {told} "
         "(lsmgeo.cameras.resize keeps the half pixel right), or use the photographs of K's size."
@@ -145,29 +146,28 @@ def scaled(asis: Hypothesis, factor: np.ndarray) -> Candidate:
     return Candidate("K of another resolution", f"with K times {told}", remedy, changed)
 
 
-def focal_mistakes(asis: Hypothesis, scales: Iterable[float]) -> list[Candidate]:
-    """Focal lengths that are wrong by each of the scales, while the principal points are right."""
-    found = []
-    for scale in scales:
-        factor = np.array([[scale, scale, 1.0], [scale, scale, 1.0], [1.0, 1.0, 1.0]])
-        remedy = f"The focal lengths are off by a factor of {scale:.4g}: check angles, units and which side is meant"
-        # Both bend the same rays; far from 1, no principal point would do it.
-        remedy += "." if abs(np.log(scale)) > 0.2 else "; or it is the principal points that are off."
-        changed = _both(asis, partial(_multiplied, factor=factor))
-        found.append(Candidate("focal length off", f"with focal lengths times {scale:.4g}", remedy, changed))
-    return found
+def focal_scaled(asis: Hypothesis, scale: float) -> Candidate:
+    """Focal lengths multiplied, while the principal points are right."""
+    factor = np.array([[scale, scale, 1.0]] * 2 + [[1.0, 1.0, 1.0]])
+    remedy = f"The focal lengths are off by a factor of {scale:.4g}: check angles, units and which side is meant"
+    # Both bend the same rays; far from 1, no principal point would do it.
+    remedy += "." if abs(np.log(scale)) > 0.2 else "; or it is the principal points that are off."
+    changed = _both(asis, lambda cameras: cameras._replace(K=cameras.K * factor))
+    return Candidate("focal length off", f"with focal lengths times {scale:.4g}", remedy, changed)
 
 
-def depth_mistakes(asis: Hypothesis, scales: Iterable[float] = ()) -> list[Candidate]:
-    """Depth along the ray, and depth in other units: common ones and ``scales``."""
+def depth_scaled(asis: Hypothesis, scale: float) -> Candidate:
+    """Depth multiplied."""
+    remedy = f"Depth and translations are in different units: multiply depth by {scale:.4g}."
+    corrected = f"with depth times {scale:.4g}"
+    return Candidate("depth in other units", corrected, remedy, asis._replace(depth_scale=scale))
+
+
+def depth_mistakes(asis: Hypothesis) -> list[Candidate]:
+    """Depth along the ray, and depth in other units that are common."""
     along = "Depth is the distance along the ray: divide it by the length of K^-1 (x, y, 1), which makes it camera z."
-    found = [Candidate("depth along the ray", "along the ray", along, asis._replace(along_ray=True))]
-    for scale in [*UNITS, *(1 / unit for unit in UNITS), *scales]:
-        remedy = f"Depth and translations are in different units: multiply depth by {scale:.4g}."
-        found.append(
-            Candidate("depth in other units", f"with depth times {scale:.4g}", remedy, asis._replace(depth_scale=scale))
-        )
-    return found
+    found = Candidate("depth along the ray", "along the ray", along, asis._replace(along_ray=True))
+    return [found, *(depth_scaled(asis, scale) for scale in (*UNITS, *(1 / unit for unit in UNITS)))]
 
 
 def _both(asis: Hypothesis, change: Callable[[Geometry], Geometry]) -> Hypothesis:
@@ -180,20 +180,8 @@ def _inverted(cameras: Geometry) -> Geometry:
     return cameras._replace(R=np.linalg.inv(cameras.R), t=cameras.centers)
 
 
-def _multiplied(cameras: Geometry, factor: np.ndarray) -> Geometry:
-    return cameras._replace(K=cameras.K * factor)
-
-
 def _turned(cameras: Geometry, turn: np.ndarray) -> Geometry:
     return cameras._replace(R=turn @ cameras.R, t=cameras.t @ turn.T)
-
-
-def _inverted_and_turned(cameras: Geometry, turn: np.ndarray) -> Geometry:
-    return _turned(_inverted(cameras), turn)
-
-
-def _mirrored(cameras: Geometry, mirror: np.ndarray) -> Geometry:
-    return cameras._replace(R=cameras.R @ mirror)
 
 
 def _flipped(cameras: Geometry, sizes: np.ndarray, axis: int) -> Geometry:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lsmgeo.diagnosis.evidence import Features, Outlines, Points, Solids, is_rectified
+from lsmgeo.diagnosis.findings import counted
 from lsmgeo.diagnosis.mistakes import Candidate
 from lsmgeo.diagnosis.residuals import pair_distances, view_costs
 from lsmgeo.diagnosis.silhouettes import draw_solid, intersection_over_union
@@ -55,12 +56,11 @@ def order_mistakes(
         photographs = asis.photographs.taken(order)
         alone = asis._replace(photographs=photographs)
         # Depth and points may have gone with the photographs, or stayed with the cameras.
-        found.append(Candidate(name, corrected, remedy, alone._replace(beside=asis.beside.taken(order))))
-        found.append(Candidate(name, corrected, remedy, alone))
+        changed = [alone._replace(beside=asis.beside.taken(order)), alone]
         if np.ptp(asis.photographs.K, axis=0).any():
             # Or every photograph has kept its own K, and the poses alone are in another order.
-            kept = asis._replace(photographs=photographs._replace(K=asis.photographs.K))
-            found.append(Candidate(name, corrected, remedy, kept))
+            changed.append(asis._replace(photographs=photographs._replace(K=asis.photographs.K)))
+        found += [Candidate(name, corrected, remedy, hypothesis) for hypothesis in changed]
     return found
 
 
@@ -76,24 +76,17 @@ def named_orders(names: Sequence[str]) -> list[tuple[np.ndarray, str]]:
     rows = np.arange(len(names))
     text = np.array(sorted(range(len(names)), key=lambda row: names[row]), int)
     number = np.array(sorted(range(len(names)), key=lambda row: _natural(names[row])), int)
-    found = []
     # Row i of one order belongs to row i of the other.
-    for from_, to, words in (
-        (text, number, "by their numbers, not as text"),
-        (number, text, "as text, not by numbers"),
-    ):
-        order = np.zeros(len(names), int)
-        order[to] = from_
-        found.append((order, f"the names ordered {words}"))
-    found.append((rows[::-1].copy(), "the order reversed"))
+    found = [
+        (text[np.argsort(number)], "the names ordered by their numbers, not as text"),
+        (number[np.argsort(text)], "the names ordered as text, not by numbers"),
+        (rows[::-1].copy(), "the order reversed"),
+    ]
     for shift in sorted(range(1, len(names)), key=lambda shift: min(shift, len(names) - shift)):
         signed = shift if 2 * shift <= len(names) else shift - len(names)
-        found.append((np.roll(rows, -shift), f"every photograph at the camera {_places(signed)}"))
+        places = f"{counted(abs(signed), 'places')} {'later' if signed > 0 else 'earlier'}"
+        found.append((np.roll(rows, -shift), f"every photograph at the camera {places}"))
     return [(order, words) for order, words in found if not np.array_equal(order, rows)]
-
-
-def _places(shift: int) -> str:
-    return f"{abs(shift)} place{'s' if abs(shift) > 1 else ''} {'later' if shift > 0 else 'earlier'}"
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
@@ -264,12 +257,9 @@ def _completed(cameras: dict[int, int], count: int) -> np.ndarray:
     """Views of which nothing is known keep their camera where it is free."""
     order = np.full(count, -1)
     order[list(cameras)] = list(cameras.values())
-    free = np.ones(count, bool)
-    free[list(cameras.values())] = False
-    unknown = np.flatnonzero(order < 0)
-    kept = unknown[free[unknown]]
-    order[kept], free[kept] = kept, False
-    order[order < 0] = np.flatnonzero(free)
+    kept = np.setdiff1d(np.flatnonzero(order < 0), order)
+    order[kept] = kept
+    order[order < 0] = np.setdiff1d(np.arange(count), order)
     return order
 
 

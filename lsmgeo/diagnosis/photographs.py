@@ -8,14 +8,14 @@ import numpy as np
 
 from lsmgeo.data import PosedImages
 from lsmgeo.data.posed import Voxels
-from lsmgeo.diagnosis.evidence import Evidence, Features, Points, gather_evidence
+from lsmgeo.diagnosis.evidence import Evidence, Features, Points, gather_evidence, pair_medians
 from lsmgeo.diagnosis.explain import explain, invisible_mistakes, is_suspicious
 from lsmgeo.diagnosis.facts import describe_scene, find_gap, implausibilities
-from lsmgeo.diagnosis.findings import LIMITS, Cause, Check, Findings, badness, tell
+from lsmgeo.diagnosis.findings import LIMITS, Cause, Check, Findings, badness, share, tell
 from lsmgeo.diagnosis.geometry import Hypothesis, as_they_are
 from lsmgeo.diagnosis.half_pixel import Shift, find_shifts, is_certain, is_half_a_pixel, is_large, nearer_half
 from lsmgeo.diagnosis.matching import choose_views
-from lsmgeo.diagnosis.residuals import reprojection_errors
+from lsmgeo.diagnosis.residuals import reprojection_errors, sampson_distances
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -41,7 +41,6 @@ class Examination(NamedTuple):
     findings: Findings
     evidence: tuple[Evidence, ...]
     hypothesis: Hypothesis
-    views: np.ndarray
 
 
 def examine(content: Any, path: Path) -> Findings:
@@ -118,7 +117,7 @@ def examine_photographs(scene: PosedImages) -> Examination:
     facts = describe_scene(scene, views, evidence, asis, sizes)
     gap = None if checks or cause is not None else find_gap(scene)
     findings = Findings(tuple(facts), tuple(checks), cause, tuple(remarks), gap=gap)
-    return Examination(findings, tuple(evidence), asis, views)
+    return Examination(findings, tuple(evidence), asis)
 
 
 def _beats_single_views(explanation: Explanation, *, passed: bool) -> bool:
@@ -172,22 +171,13 @@ def _with_views(
     scene: PosedImages, checks: list[Check], evidence: Sequence[Evidence], asis: Hypothesis
 ) -> tuple[list[Check], Cause | None]:
     """Add a check of single views, where all others agree; a view that does not is a cause of its own."""
-    off: set[int] = set()
-    judged: set[int] = set()
-    for item in evidence:
-        if isinstance(item, Features):
-            found, known = _off_by_features(item, asis)
-        elif isinstance(item, Points):
-            found, known = _off_by_points(item, asis)
-        else:
-            continue
-        off |= found
-        judged |= known
+    found = [_off_by_features(item, asis) for item in evidence if isinstance(item, Features)]
+    found += [_off_by_points(item, asis) for item in evidence if isinstance(item, Points)]
+    off, judged = (set().union(*views) for views in zip((set(), set()), *found, strict=True))
     if not judged or len(off) > MOST_OFF * len(judged):
         return checks, None
-    value = 100 * (1 - len(off) / len(judged))
-    name = "photographs that agree with the others"
-    checks = [*checks, Check(name, value, "%", 100.0, len(judged), "photographs", at_least=True)]
+    agree = 1 - len(off) / len(judged)
+    checks = [*checks, share("photographs that agree with the others", agree, "views", len(judged), "photographs")]
     if not off:
         return checks, None
     names = ", ".join(scene.names[view] for view in sorted(off)[:LISTED])
@@ -199,7 +189,7 @@ def _with_views(
 def _off_by_features(features: Features, asis: Hypothesis) -> tuple[set[int], set[int]]:
     """Views all of whose pairs are bad, taken away one by one until the others agree."""
     first, second = features.matches.first, features.matches.second
-    medians = features.pair_medians(asis)
+    medians = pair_medians(np.abs(sampson_distances(features.matches, asis.photographs)), features.matches)
     # Where most pairs are bad, no single view is.
     if not np.median(medians) <= features.limit:
         return set(), set()
@@ -207,8 +197,8 @@ def _off_by_features(features: Features, asis: Hypothesis) -> tuple[set[int], se
     left = np.ones(len(first), bool)
     off: set[int] = set()
     while (bad & left).any():
-        views = np.unique(np.concatenate([first[left], second[left]]))
-        pairs = {int(view): left & ((first == view) | (second == view)) for view in views}
+        views = np.union1d(first[left], second[left]).tolist()
+        pairs = {view: left & ((first == view) | (second == view)) for view in views}
         enough = {view: of for view, of in pairs.items() if of.sum() >= LEAST_PAIRS}
         shares = {view: (float(bad[of].mean()), int(bad[of].sum())) for view, of in enough.items()}
         if not shares:
@@ -219,7 +209,7 @@ def _off_by_features(features: Features, asis: Hypothesis) -> tuple[set[int], se
         off.add(view)
         left &= ~pairs[view]
     counts = np.bincount(np.concatenate([first, second]))
-    return off, {int(view) for view in np.flatnonzero(counts >= LEAST_PAIRS)}
+    return off, set(np.flatnonzero(counts >= LEAST_PAIRS).tolist())
 
 
 def _standing_out(medians: np.ndarray, limit: float) -> float:
@@ -229,11 +219,8 @@ def _standing_out(medians: np.ndarray, limit: float) -> float:
 
 def _off_by_points(points: Points, asis: Hypothesis) -> tuple[set[int], set[int]]:
     errors, _, views = reprojection_errors(points.points, asis.beside)
-    known = [view for view in np.unique(views) if (views == view).sum() >= LEAST_OBSERVED]
+    known = np.flatnonzero(np.bincount(views) >= LEAST_OBSERVED)
     medians = np.array([np.median(errors[views == view]) for view in known])
-    if not known:
+    if not len(known) or not np.median(medians) <= points.limit:
         return set(), set()
-    if not np.median(medians) <= points.limit:
-        return set(), set()
-    limit = _standing_out(medians, points.limit)
-    return {int(view) for view, median in zip(known, medians, strict=True) if median > limit}, {int(v) for v in known}
+    return set(known[medians > _standing_out(medians, points.limit)].tolist()), set(known.tolist())

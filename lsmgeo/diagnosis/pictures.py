@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lsmgeo.diagnosis.camera_drawing import Content, draw_cameras, surface_of
-from lsmgeo.diagnosis.evidence import DepthMaps, Features, Solids, StereoPair
-from lsmgeo.diagnosis.geometry import fundamental, homogeneous
+from lsmgeo.diagnosis.evidence import DepthMaps, Features, Solids, StereoPair, pair_medians
+from lsmgeo.diagnosis.geometry import evenly, fundamental, homogeneous
+from lsmgeo.diagnosis.matching import shrunk
 from lsmgeo.diagnosis.residuals import sampson_distances
 from lsmgeo.diagnosis.silhouettes import draw_solid
 from lsmgeo.diagnosis.surfaces import seen_errors, surface_points, warped
@@ -72,7 +73,7 @@ def _cameras(scene: PosedImages, examination: Examination, title: str) -> bytes:
 def _content(scene: PosedImages, examination: Examination) -> Content:
     """What there is to be seen: sparse points, voxels, or points of depth maps."""
     if scene.points is not None and len(scene.points.positions):
-        chosen = np.unique(np.linspace(0, len(scene.points.positions) - 1, MOST_POINTS).astype(int))
+        chosen = evenly(len(scene.points.positions), MOST_POINTS)
         return Content(scene.points.positions[chosen], scene.points.colours[chosen] / 255.0)
     if scene.voxels is not None:
         return surface_of(scene.voxels)
@@ -86,14 +87,8 @@ def _content(scene: PosedImages, examination: Examination) -> Content:
 
 def _shown(scene: PosedImages, view: int) -> tuple[np.ndarray, float]:
     """A photograph for drawing (h, w, 3) uint8, shrunk, and its pixels per pixel drawn."""
-    import cv2
-
-    image = scene.load(view)
-    height, width = image.shape[1:]
-    zoom = max(1.0, max(height, width) / LONGEST_SIDE)
-    picture = as_pixels(image)
-    size = (max(1, round(width / zoom)), max(1, round(height / zoom)))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA) if zoom > 1 else picture), zoom
+    picture = as_pixels(scene.load(view))
+    return shrunk(picture, LONGEST_SIDE), max(1.0, max(picture.shape) / LONGEST_SIDE)
 
 
 def _show(axes: Axes, picture: np.ndarray, zoom: float, **options: object) -> None:
@@ -108,49 +103,43 @@ def _show(axes: Axes, picture: np.ndarray, zoom: float, **options: object) -> No
 def _matches(scene: PosedImages, examination: Examination, features: Features, title: str) -> bytes:
     """The pair whose error is nearest to the median of all pairs, with matches and their epipolar lines."""
     cameras, matches = examination.hypothesis.photographs, features.matches
-    medians = features.pair_medians(examination.hypothesis)
+    medians = pair_medians(np.abs(sampson_distances(matches, cameras)), matches)
     A = fundamental(cameras, matches.first, matches.second)
     lined = np.abs(A).max((1, 2)) > 0
     ranked = np.argsort(np.abs(medians - np.median(medians[lined] if lined.any() else medians)), kind="stable")
     pair = next((int(index) for index in ranked if lined[index]), int(ranked[0]))
     views = int(matches.first[pair]), int(matches.second[pair])
     chosen = np.flatnonzero(matches.pair == pair)
-    distances = np.abs(sampson_distances(matches, cameras))[chosen]
-    chosen = chosen[np.linspace(0, len(chosen) - 1, min(MOST_MATCHES, len(chosen))).astype(int)]
-    pixels = matches.pixels[chosen]
+    pixels = matches.pixels[chosen[evenly(len(chosen), MOST_MATCHES)]]
     F = A[pair]
     figure = new_figure(14, 14 * 0.5 * max(h / w for h, w in map(scene.size, views)) + 1.1, title, dpi=DPI)
     for side, (axes, view) in enumerate(zip(figure.subplots(1, 2), views, strict=True)):
-        picture, zoom = _shown(scene, view)
-        _show(axes, picture, zoom)
+        _show(axes, *_shown(scene, view))
         height, width = scene.size(view)
         other = homogeneous(pixels[:, 1 - side])
         for (x, y), line, colour in zip(
             pixels[:, side], other @ (F if side == 0 else F.T), _colours(len(pixels)), strict=True
         ):
             if np.abs(line[:2]).max() > 0:
-                _draw_line(axes, line, width, height, colour)
+                with np.errstate(divide="ignore"):  # upright lines
+                    slope = -line[0] / line[1]
+                axes.axline(-line[2] * line[:2] / (line[:2] @ line[:2]), slope=slope, color=colour, linewidth=1.0)
             axes.plot(x, y, "o", color=colour, markersize=6, markeredgecolor="white", markeredgewidth=0.8)
         axes.set_xlim(-0.5, width - 0.5)
         axes.set_ylim(height - 0.5, -0.5)
         axes.set_title(f"{view}: {scene.names[view]}", fontsize=10)
     figure.supxlabel(
-        f"{len(pixels)} of the pair's {len(distances)} matches, each on the epipolar line of its match if the cameras "
-        f"are right; median distance {np.median(distances):.3g} px",
+        f"{len(pixels)} of the pair's {len(chosen)} matches, each on the epipolar line of its match if the cameras "
+        f"are right; median distance {medians[pair]:.3g} px",
         fontsize=9,
     )
     return as_png(figure)
 
 
-def _draw_line(axes: Axes, line: np.ndarray, width: int, height: int, colour: np.ndarray) -> None:
-    """The line a x + b y + c = 0 across a picture."""
-    a, b, c = line
-    if abs(b) > abs(a):
-        x = np.array([-0.5, width - 0.5])
-        axes.plot(x, -(a * x + c) / b, color=colour, linewidth=1.0)
-    else:
-        y = np.array([-0.5, height - 0.5])
-        axes.plot(-(b * y + c) / a, y, color=colour, linewidth=1.0)
+def _dots(axes: Axes, pixels: np.ndarray, values: np.ndarray, label: str, **options: Any) -> None:
+    """Values at pixels, by colours that a bar beside explains."""
+    dots = axes.scatter(pixels[:, 0], pixels[:, 1], c=values, s=7, linewidths=0, **options)
+    axes.figure.colorbar(dots, ax=axes, label=label, shrink=0.85)
 
 
 def _depth(scene: PosedImages, examination: Examination, item: DepthMaps, title: str) -> bytes:
@@ -163,19 +152,14 @@ def _depth(scene: PosedImages, examination: Examination, item: DepthMaps, title:
         view = min(found, key=lambda view: abs(medians[view] - float(np.median(list(medians.values())))))
         other, known, errors = found[view]
         picture, zoom = _shown(scene, view)
-        pixels = item.surfaces.pixels[view][known]
-        for axes, values, words, colours in (
-            # Near is red and far is blue, as in all pictures of depth.
-            (left, item.surfaces.depths[view][known], "depth [world units]", "turbo_r"),
-            (right, 100 * np.abs(errors), "difference [%]", "turbo"),
-        ):
+        pixels, depth = item.surfaces.pixels[view][known], item.surfaces.depths[view][known]
+        for axes in (left, right):
             _show(axes, picture, zoom, alpha=0.5)
-            high = float(np.percentile(values, 95)) if axes is left else max(4.0, 2 * 100 * medians[view])
-            low = float(np.percentile(values, 5)) if axes is left else 0.0
-            dots = axes.scatter(
-                *pixels.T, c=values, s=7, cmap=colours, vmin=low, vmax=max(high, low + 1e-9), linewidths=0
-            )
-            figure.colorbar(dots, ax=axes, label=words, shrink=0.85)
+        low, high = np.percentile(depth, (5, 95))
+        # Near is red and far is blue, as in all pictures of depth.
+        _dots(left, pixels, depth, "depth [world units]", cmap="turbo_r", vmin=low, vmax=max(high, low + 1e-9))
+        highest = max(4.0, 2 * 100 * medians[view])
+        _dots(right, pixels, 100 * np.abs(errors), "difference [%]", cmap="turbo", vmin=0, vmax=highest)
         left.set_title(f"depth of view {view} ({scene.names[view]})", fontsize=10)
         right.set_title(f"against that of view {other}: median {100 * medians[view]:.3g} %", fontsize=10)
     else:
@@ -194,8 +178,7 @@ def _warp(examination: Examination, item: StereoPair, title: str) -> bytes:
     pixels, moved, unmoved = warped(item.surfaces, examination.hypothesis, item.pictures, view)
     for axes, values, words in ((left, unmoved, "as they are"), (right, moved, "warped by depth")):
         _show(axes, item.pictures[view], 1.0, cmap="gray", alpha=0.5)
-        dots = axes.scatter(*pixels.T, c=values, s=7, cmap="turbo", vmin=0, vmax=60, linewidths=0)
-        figure.colorbar(dots, ax=axes, label="grey levels", shrink=0.85)
+        _dots(axes, pixels, values, "grey levels", cmap="turbo", vmin=0, vmax=60)
         median = f"{np.median(values):.3g}" if len(values) else "none"
         axes.set_title(f"difference of the two pictures {words}: median {median}", fontsize=10)
         axes.set_xlim(-0.5, width - 0.5)
@@ -206,17 +189,16 @@ def _warp(examination: Examination, item: StereoPair, title: str) -> bytes:
 def _outlines(scene: PosedImages, examination: Examination, item: Solids, title: str) -> bytes:
     """Photographs with the border of the projected voxels, up to eight views."""
     assert item.silhouettes is not None
-    rows = np.unique(np.linspace(0, len(item.silhouettes.views) - 1, 8).astype(int)).tolist()
+    rows = evenly(len(item.silhouettes.views), 8).tolist()
     columns = min(4, len(rows))
-    lines = int(np.ceil(len(rows) / columns))
+    lines = -(-len(rows) // columns)
     figure = new_figure(3.4 * columns, 3.6 * lines + 0.8, title, dpi=DPI)
     grid = figure.subplots(lines, columns, squeeze=False).ravel()
     for axes in grid:
         axes.axis("off")
     for axes, row in zip(grid, rows, strict=False):
         view, mask, step = (values[row] for values in item.silhouettes)
-        picture, zoom = _shown(scene, view)
-        _show(axes, picture, zoom)
+        _show(axes, *_shown(scene, view))
         drawn = draw_solid(item.solid, examination.hypothesis.photographs, view, mask.shape, step)
         x, y = np.arange(mask.shape[1]) * step, np.arange(mask.shape[0]) * step
         for borders, colour in ((mask, "tab:green"), (drawn, "tab:red")):

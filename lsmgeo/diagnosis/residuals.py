@@ -112,13 +112,10 @@ def reprojections(points: SparsePoints, geometry: Geometry, view: int, camera: i
 
 def reprojection_errors(points: SparsePoints, geometry: Geometry) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distances (M,) px, depths (M,), and the view (M,) of every observation."""
-    errors, depths, views = [np.zeros(0)], [np.zeros(0)], [np.zeros(0, int)]
-    for view, observed in enumerate(points.observations):
-        difference, depth = reprojections(points, geometry, view, view)
-        errors.append(np.linalg.norm(difference, axis=1))
-        depths.append(depth)
-        views.append(np.full(len(observed.points), view))
-    return np.concatenate(errors), np.concatenate(depths), np.concatenate(views)
+    found = [reprojections(points, geometry, view, view) for view in range(len(points.observations))]
+    differences, depths = (np.concatenate(values) for values in zip(*found, strict=True))
+    views = np.repeat(np.arange(len(found)), [len(depth) for _, depth in found])
+    return np.linalg.norm(differences, axis=1), depths, views
 
 
 def view_costs(points: SparsePoints, geometry: Geometry) -> np.ndarray:

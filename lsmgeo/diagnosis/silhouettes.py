@@ -170,14 +170,14 @@ def epipolar_tangency(first: np.ndarray, second: np.ndarray, cameras: Geometry) 
     K, backward, centers = cameras.K, np.linalg.inv(cameras.R), cameras.centers
     baseline = centers[1] - centers[0]
     length = np.linalg.norm(baseline)
-    rays = []
-    for points, matrix, turn in zip((first, second), K, backward, strict=True):
-        ray = homogeneous(points) @ np.linalg.inv(matrix).T @ turn.T
-        rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
     if not length > 1e-9 * max(1.0, float(np.linalg.norm(centers, axis=1).max())):
         return nowhere
     axis = baseline / length
-    across = [ray - (ray @ axis)[:, None] * axis for ray in rays]  # the part that tells the half-plane
+    across = []  # the part of the rays that tells the half-plane
+    for points, matrix, turn in zip((first, second), K, backward, strict=True):
+        ray = homogeneous(points) @ np.linalg.inv(matrix).T @ turn.T
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        across.append(ray - (ray @ axis)[:, None] * axis)
     middle = across[0].mean(0) / np.linalg.norm(across[0].mean(0))
     side = np.cross(axis, middle)
     ends, widths = [], []

@@ -174,18 +174,14 @@ def _cause(placed: _Placed, samples: np.ndarray, path: Path, percent: float) -> 
         return None
     # The fewest changes first, so that a symmetric solid is not said to be turned as well.
     for name, other in _placements(placed, path):
-        turned = sorted(_orders(other.occupied), key=lambda order: order[0])
-        for changes, words, occupied in turned:
-            found = _Placed(occupied, other.lower, other.upper)
-            fits = 100 * _inside(found, samples)
+        for changes, words, occupied in sorted(_orders(other.occupied), key=lambda order: order[0]):
+            fits = 100 * _inside(other._replace(occupied=occupied), samples)
             if fits < 100 * INSIDE or fits < percent + 100 * CLEARLY:
                 continue
+            title, read = "axes of the voxels exchanged or flipped", f"Read the file with placement={name!r}"
+            remedy = f"{read} and turn the grid: {words}." if name else f"Turn the grid before use: {words}."
             if changes == 0:
-                title, remedy = "voxels placed otherwise", f"Read the file with placement={name!r}."
-            else:
-                title, remedy = "axes of the voxels exchanged or flipped", f"Turn the grid before use: {words}."
-                if name:
-                    remedy = f"Read the file with placement={name!r} and turn the grid: {words}."
+                title, remedy = "voxels placed otherwise", f"{read}."
             evidence = f"with it, the surface in occupied voxels rises from {percent:.1f} % to {fits:.1f} %"
             return Cause(title, evidence, remedy)
     return None

@@ -112,17 +112,14 @@ def _seen(surfaces: Surfaces, hypothesis: Hypothesis, points: np.ndarray, view: 
     return depth, np.where(inside & (there > 0), there, np.nan)
 
 
-def relative_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
-    """Signed relative differences of depth, carried over against measured there, and the view carried, (M,) and (M,).
+def relative_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> np.ndarray:
+    """Signed relative differences of depth, carried over against measured there, (M,).
 
     Of each view, the neighbours are asked into which nearly most of its pixels fall under this very hypothesis (cameras
     that are wrong may place views anywhere), and of them the one counts that agrees best. Pixels that another surface
     hides give large differences; the median bears them.
     """
-    found = seen_errors(surfaces, hypothesis)
-    errors = [np.zeros(0), *(errors for _, _, errors in found.values())]
-    views = [np.zeros(0, int), *(np.full(len(errors), view) for view, (_, _, errors) in found.items())]
-    return np.concatenate(errors), np.concatenate(views)
+    return np.concatenate([np.zeros(0), *(errors for _, _, errors in seen_errors(surfaces, hypothesis).values())])
 
 
 def seen_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> dict[int, tuple[int, np.ndarray, np.ndarray]]:

@@ -43,25 +43,6 @@ def room():
     return trace(*on_an_arc(7))
 
 
-@pytest.fixture(autouse=True)
-def same_matches(request, monkeypatch):
-    """Mistakes in cameras leave the photographs alone: each set of them is matched once."""
-    monkeypatch.setattr(evidence, "match_features", request.getfixturevalue("matches_by_paths"))
-
-
-@pytest.fixture(scope="session")
-def matches_by_paths():
-    known = {}
-
-    def match(scene, views):
-        key = tuple(scene.paths)
-        if key not in known:
-            known[key] = match_features(scene, views)
-        return known[key]
-
-    return match
-
-
 @pytest.fixture(scope="session")
 def photographs(room, tmp_path_factory):
     """Nothing but textured photographs."""

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from lsmgeo import data
-from lsmgeo.diagnosis import evidence
-from lsmgeo.diagnosis.matching import match_features
 from lsmgeo.diagnosis.photographs import examine_photographs
 from tests.diagnosis.textured import planted
 
@@ -20,20 +18,6 @@ SETS = {
     "strecha_fountain_quarter": ("epipolar", 0.09),
     "colmap_scene": ("reprojection", 0.25),
 }
-MATCHES = {}
-
-
-@pytest.fixture(autouse=True)
-def same_matches(monkeypatch):
-    """Each set of photographs is matched once."""
-
-    def match(scene, views):
-        key = tuple(scene.paths)
-        if key not in MATCHES:
-            MATCHES[key] = match_features(scene, views)
-        return MATCHES[key]
-
-    monkeypatch.setattr(evidence, "match_features", match)
 
 
 def scene(name):

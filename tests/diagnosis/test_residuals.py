@@ -21,7 +21,7 @@ from lsmgeo.diagnosis.residuals import (
     view_costs,
 )
 from lsmgeo.diagnosis.silhouettes import Silhouettes, Solid, near_cells, overlap, within_a_cell
-from lsmgeo.diagnosis.surfaces import Surfaces, relative_errors
+from lsmgeo.diagnosis.surfaces import Surfaces, relative_errors, seen_errors
 from lsmgeo.grids import VoxelGrid
 
 RNG = np.random.default_rng(0)
@@ -57,7 +57,7 @@ def matched(geometry, pairs, points, noise=0.0):
     pixels = [np.stack([seen(geometry, a, points), seen(geometry, b, points)], 1) for a, b in pairs]
     pixels = np.concatenate(pixels) + noise * RNG.standard_normal((len(pairs) * len(points), 2, 2))
     first, second = np.array(pairs).T
-    return Matches(first, second, np.repeat(np.arange(len(pairs)), len(points)), pixels, np.zeros(len(geometry.K), int))
+    return Matches(first, second, np.repeat(np.arange(len(pairs)), len(points)), pixels)
 
 
 def test_exact_matches_have_no_distance_and_lie_in_front():
@@ -77,7 +77,7 @@ def test_sampson_distance_is_half_the_gap_of_a_sideways_pair():
     K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
     geometry = Geometry(np.stack([K, K]), np.stack([np.eye(3)] * 2), np.array([[0.0, 0, 0], [-1, 0, 0]]))
     pixels = np.array([[[100.0, 50.0], [90.0, 53.0]], [[10.0, 20.0], [4.0, 20.0]]])
-    matches = Matches(np.array([0]), np.array([1]), np.zeros(2, int), pixels, np.zeros(2, int))
+    matches = Matches(np.array([0]), np.array([1]), np.zeros(2, int), pixels)
     np.testing.assert_allclose(np.abs(sampson_distances(matches, geometry)), [3 / np.sqrt(2), 0], atol=1e-12)
     np.testing.assert_allclose(pair_distances(pixels[:1], geometry, np.array([0]), np.array([1])), [3 / np.sqrt(2)])
 
@@ -155,14 +155,13 @@ def test_depth_of_a_plane_agrees_with_itself_and_with_no_other():
     v, u = (grid.ravel() for grid in np.mgrid[20:60, 25:75])
     maps = (plane_depth((80, 100), 0.0), plane_depth((80, 100), 0.0) - 1)
     surfaces = Surfaces(maps, (1, 1), (np.stack([u, v], 1).astype(float),) * 2, tuple(m[v, u] for m in maps))
-    errors, _ = relative_errors(surfaces, Hypothesis(geometry, geometry))
-    np.testing.assert_allclose(errors, 0, atol=1e-12)
+    np.testing.assert_allclose(relative_errors(surfaces, Hypothesis(geometry, geometry)), 0, atol=1e-12)
     wrong = surfaces._replace(maps=(maps[0], maps[1] * 1.1), depths=(surfaces.depths[0], surfaces.depths[1] * 1.1))
-    errors, views = relative_errors(wrong, Hypothesis(geometry, geometry))
-    np.testing.assert_allclose(errors[views == 0], 3 / 3.3 - 1)
-    np.testing.assert_allclose(errors[views == 1], 4.3 / 4 - 1)
+    found = seen_errors(wrong, Hypothesis(geometry, geometry))
+    np.testing.assert_allclose(found[0][2], 3 / 3.3 - 1)
+    np.testing.assert_allclose(found[1][2], 4.3 / 4 - 1)
     # Twice all depth is not this scene, for the cameras stay one apart.
-    errors, _ = relative_errors(surfaces, Hypothesis(geometry, geometry, depth_scale=2.0))
+    errors = relative_errors(surfaces, Hypothesis(geometry, geometry, depth_scale=2.0))
     np.testing.assert_allclose(np.sort(np.unique(np.round(errors, 12))), [7 / 6 - 1, 7 / 8 - 1][::-1])
 
 

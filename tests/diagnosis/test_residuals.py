@@ -27,11 +27,6 @@ from lsmgeo.grids import VoxelGrid
 RNG = np.random.default_rng(0)
 
 
-def rotation(rng):
-    turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
-    return turn * np.sign(np.linalg.det(turn))
-
-
 def cameras(count, rng):
     """Cameras around the origin that look roughly at it."""
     K, R, t = [], [], []

@@ -59,7 +59,7 @@ class ShapeDataset(Dataset[Sample]):
     Example:
         >>> import tempfile, torch
         >>> from lsmgeo.cameras import orbit
-        >>> from lsmgeo.data import collate, encode_sample, write_shard
+        >>> from lsmgeo.data import ShardSet, collate, encode_sample, write_shard
         >>> cameras = orbit(torch.zeros(5), 10.0, 2.0, focal_length=90.0, height=48, width=48)
         >>> sample = Sample(torch.rand(5, 3, 48, 48), cameras, None, None, None, None, "chair", "chair-0")
         >>> with tempfile.TemporaryDirectory() as folder:

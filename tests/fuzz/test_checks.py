@@ -23,281 +23,171 @@ from lsmgeo.errors import CameraError, DeviceError, DTypeError, GridError, LsmGe
 from tests.fuzz.calls import sweep, unproject, with_scale, with_value
 from tests.fuzz.positions import DEPTHS, FEATURES, GRID, VIEWS, VOLUME, B, V, right_cameras
 
+# What an error must say, and a call that raises it.
 MISTAKES = {
-    "other number of cameras": (
-        lambda: unproject(torch.rand(2, 3, 32, 56, 56), right_cameras(2, 4)),
-        ShapeError,
-        "Unproject: features must be (B, V, C, h, w) with B*V = 8 cameras; got (2, 3, 32, 56, 56), that is 6",
-    ),
-    "features without views": (
-        lambda: unproject(torch.rand(6, 4, 5, 7)),
-        ShapeError,
-        "Unproject: features must be (B, V, C, h, w) with B*V = 6 cameras; got (6, 4, 5, 7)",
-    ),
-    "integer image": (
-        lambda: unproject(torch.ones(B, V, 3, 5, 7, dtype=torch.uint8)),
-        DTypeError,
-        "Unproject: features must be of float16, bfloat16, float32, float64; got torch.uint8",
-    ),
-    "views and scenes swapped": (
-        lambda: unproject(torch.rand(3, 2, 4, 5, 7)),
-        ShapeError,
-        "Unproject: cameras must have leading shape (B, V) = (3, 2), or (B*V,) with the view fastest; got (2, 3)",
-    ),
-    "no view": (
-        lambda: unproject(torch.rand(2, 0, 4, 5, 7), right_cameras(2, 0)),
-        ShapeError,
-        "got (2, 0, 4, 5, 7)",
-    ),
-    "no camera to sweep": (lambda: sweep(views=right_cameras(2, 0)), ShapeError, "at least one view"),
-    "3x4 extrinsics": (
-        lambda: unproject(views=VIEWS._replace(cam_from_world=VIEWS.cam_from_world[..., :3, :])),
-        ShapeError,
-        "Unproject: cameras.cam_from_world must be (..., 4, 4), the whole world-to-camera matrix; got (2, 3, 3, 4)",
-    ),
-    "half-precision cameras": (
-        lambda: unproject(views=VIEWS._replace(intrinsics=VIEWS.intrinsics.half())),
-        DTypeError,
-        "cameras.intrinsics must be of float32, float64; got torch.float16",
-    ),
-    "mixed camera dtypes": (
-        lambda: unproject(views=VIEWS._replace(intrinsics=VIEWS.intrinsics.double())),
-        DTypeError,
-        "of one dtype; got torch.float64 and torch.float32",
-    ),
-    "devices": (
-        lambda: unproject(FEATURES.to("meta")),
-        DeviceError,
-        "Unproject: all tensors must be on one device; got features on meta, cameras on cpu",
-    ),
-    "not finite": (
-        lambda: unproject(views=with_value("intrinsics", (1, 0, 0, 2), float("nan"))),
-        CameraError,
-        "Unproject: cameras[1, 0]: intrinsics must be finite",
-    ),
-    "infinite translation": (
-        lambda: unproject(views=with_value("cam_from_world", (0, 2, 1, 3), float("inf"))),
-        CameraError,
-        "Unproject: cameras[0, 2]: cam_from_world must be finite",
-    ),
-    "negative focal length": (
-        lambda: unproject(views=with_value("intrinsics", (0, 1, 1, 1), -20.0)),
-        CameraError,
-        "cameras[0, 1]: focal lengths must be positive pixels, 1e-6 of the image size at least; got -20",
-    ),
-    "singular intrinsics": (
-        lambda: unproject(views=with_value("intrinsics", (0, 1, 0, 0), 0.0)),
-        CameraError,
-        "cameras[0, 1]: focal lengths must be positive pixels, 1e-6 of the image size at least; got 0",
-    ),
-    "last row of K": (
-        lambda: unproject(views=with_value("intrinsics", (1, 1, 2, 2), 2.0)),
-        CameraError,
-        "cameras[1, 1]: intrinsics must have the last row (0, 0, 1); its largest deviation is 1",
-    ),
-    "transposed K": (
-        lambda: unproject(views=VIEWS._replace(intrinsics=VIEWS.intrinsics.mT)),
-        CameraError,
-        "intrinsics must have the last row (0, 0, 1)",
-    ),
-    "vertical skew": (
-        lambda: unproject(views=with_value("intrinsics", (1, 1, 1, 0), 0.5)),
-        CameraError,
-        "cameras[1, 1]: intrinsics[1, 0] must be 0; got 0.5",
-    ),
-    "last row of the extrinsics": (
-        lambda: unproject(views=VIEWS._replace(cam_from_world=VIEWS.cam_from_world.mT)),
-        CameraError,
-        "cam_from_world must have the last row (0, 0, 0, 1)",
-    ),
-    "scaled rotation": (
-        lambda: unproject(views=with_scale(rotation=1.1)),
-        CameraError,
-        "cameras[1, 2]: the rotation must be orthonormal (a scale in it?); max |R^T R - I| is 0.21",
-    ),
-    "mirror": (
-        lambda: unproject(views=with_scale(first_row=-1.0)),
-        CameraError,
-        "cameras[1, 2]: the rotation must not mirror (is an axis flipped?); its determinant is -1",
-    ),
-    "image without pixels": (
-        lambda: unproject(views=VIEWS._replace(height=0)),
-        CameraError,
-        "Unproject: cameras.height must be at least 1 pixel",
-    ),
-    "one image without pixels": (
-        lambda: unproject(views=VIEWS._replace(width=torch.tensor([[14, 14, 0], [14, 14, 14]]))),
-        CameraError,
-        "Unproject: cameras[0, 2]: height and width must be at least 1 pixel",
-    ),
-    "mask of another shape": (
-        lambda: unproject(view_mask=torch.ones(V, B, dtype=torch.bool)),
-        ShapeError,
-        "Unproject: view_mask must be (B, V) = (2, 3); got (3, 2)",
-    ),
-    "mask of floats": (
-        lambda: unproject(view_mask=torch.ones(B, V)),
-        DTypeError,
-        "Unproject: view_mask must be a bool tensor (B, V); got a tensor (2, 3) of torch.float32",
-    ),
-    "unknown mode": (
-        lambda: unproject(mode="trilinear"),
-        OptionError,
-        "Unproject: mode must be one of 'bilinear', 'nearest'; got str 'trilinear'",
-    ),
-    "unknown padding": (
-        lambda: Unproject(padding_mode="reflection"),
-        OptionError,
-        "Unproject: padding_mode must be one of 'zeros', 'border'; got str 'reflection'",
-    ),
-    "unknown channel": (
-        lambda: Unproject(augment=("depth", "color")),
-        OptionError,
-        "Unproject: augment must be one of 'depth', 'direction'; got str 'color'",
-    ),
-    "channel twice": (
-        lambda: Unproject(augment=("depth", "depth")),
-        OptionError,
-        "Unproject: augment must not repeat a name; got ('depth', 'depth')",
-    ),
-    "unknown statistic": (
-        lambda: Unproject(reduce="median"),
-        OptionError,
-        "Unproject: reduce must be one of 'mean', 'variance', 'max'; got str 'median'",
-    ),
-    "negative near": (
-        lambda: Unproject(near=-1.0),
-        OptionError,
-        "Unproject: near must be a finite number, at least 0; got float -1.0",
-    ),
-    "unknown backend": (
-        lambda: Unproject(backend="cuda"),
-        OptionError,
-        "Unproject: backend must be one of 'auto', 'cpu', 'triton', 'reference'; got str 'cuda'",
-    ),
-    "no grid": (
-        lambda: Unproject()(FEATURES, VIEWS),
-        GridError,
-        "Unproject: grid must be given to the layer or to the call; got None",
-    ),
-    "no depths": (
-        lambda: PlaneSweepProject(GRID)(VOLUME, VIEWS),
-        GridError,
-        "PlaneSweepProject: depths must be given to the layer or to the call; got None",
-    ),
-    "grid of tensors": (
-        lambda: Unproject(torch.rand(4, 4)),
-        DTypeError,
-        "Unproject: grid must be a VoxelGrid or a FrustumGrid; got a tensor (4, 4) of torch.float32",
-    ),
-    "grids of another number of scenes": (
-        lambda: functional.unproject(FEATURES, VIEWS, VoxelGrid(2, world_from_grid=torch.eye(4).expand(3, 4, 4))),
-        ShapeError,
-        "Unproject: grid must have one pose and one row of depths, or as many as scenes, B = 2; got 3",
-    ),
-    "volume of another grid": (
-        lambda: sweep(grid=VoxelGrid((6, 4, 3))),
-        ShapeError,
-        "volume must be (B, C, D, H, W) with the grid's (D, H, W) = (6, 4, 3); got (2, 4, 3, 4, 6)",
-    ),
-    "depths that descend": (
-        lambda: sweep(depths=DEPTHS.flip(0)),
-        GridError,
-        "depths must be positive, finite and strictly ascending; got [3.0, 2.5, 2.0, 1.5, 1.0]",
-    ),
-    "equal depths": (
-        lambda: sweep(depths=torch.tensor([[1.0, 2.0], [1.0, 1.0]])),
-        GridError,
-        "depths must be positive, finite and strictly ascending; got [1.0, 1.0]",
-    ),
-    "depth zero": (
-        lambda: FrustumGrid(right_cameras(B), torch.tensor([0.0, 1.0])),
-        GridError,
-        "FrustumGrid: depths must be positive, finite and strictly ascending; got [0.0, 1.0]",
-    ),
-    "depths of other views": (
-        lambda: sweep(depths=DEPTHS.expand(3, 5)),
-        ShapeError,
-        "depths must be (P,), (B, P) or (B, V, P) with (B, V) = (2, 3); got (3, 5)",
-    ),
-    "frustums of two axes": (
-        lambda: FrustumGrid(VIEWS, DEPTHS),
-        ShapeError,
-        "FrustumGrid: camera must have leading shape () or (B,), one a scene (see cameras.select); got (2, 3)",
-    ),
-    "size of one number": (
-        lambda: sweep(size=(8,)),
-        ShapeError,
-        "PlaneSweepProject: size must be (h, w); got tuple (8,)",
-    ),
-    "no voxels": (
-        lambda: VoxelGrid((4, 0, 4)),
-        GridError,
-        "VoxelGrid: shape must be an int or (D, H, W), each at least 1; got (4, 0, 4)",
-    ),
-    "too many voxels": (
-        lambda: VoxelGrid((2**11, 2**10, 2**10)),
-        GridError,
-        "got (2048, 1024, 1024)",
-    ),
-    "crossed bounds": (
-        lambda: VoxelGrid(4, (0, 0, 0), (1, -1, 1)),
-        GridError,
-        "VoxelGrid: lower must be below upper on every axis; got 0.0 and -1.0 in y",
-    ),
-    "bounds of tensors": (
-        lambda: VoxelGrid(4, lower=torch.zeros(3)),
-        DTypeError,
-        "VoxelGrid: lower must be numbers (gradients go to world_from_grid); got a tensor (3,) of torch.float32",
-    ),
-    "singular pose": (
-        lambda: VoxelGrid(4, world_from_grid=torch.diag(torch.tensor([1.0, 1.0, 0.0, 1.0]))),
-        GridError,
-        "VoxelGrid: world_from_grid must be invertible",
-    ),
-    "projective pose": (
-        lambda: VoxelGrid(4, world_from_grid=torch.ones(4, 4)),
-        GridError,
-        "VoxelGrid: world_from_grid must be affine, its last row (0, 0, 0, 1)",
-    ),
-    "near beyond far": (
-        lambda: depth_planes(3.0, 1.0, 4),
-        GridError,
-        "depth_planes: near and far must be positive, finite and ascending; got 3.0 and 1.0",
-    ),
-    "no planes": (
-        lambda: depth_planes(1.0, 3.0, 0),
-        GridError,
-        "depth_planes: num must be an integer",
-    ),
-    "points of another number of scenes": (
-        lambda: functional.unproject_points(FEATURES, VIEWS, torch.zeros(3, 5, 3)),
-        ShapeError,
-        "unproject_points: points must be (B, N, 3) with B = 2; got (3, 5, 3)",
-    ),
-    "points that are not finite": (
-        lambda: functional.unproject_points(FEATURES, VIEWS, torch.full((B, 5, 3), torch.nan)),
-        GridError,
-        "unproject_points: points must be finite",
-    ),
-    "zero quaternion": (
-        lambda: cameras.from_colmap(torch.eye(3), torch.zeros(4), torch.zeros(3), 4, 4),
-        CameraError,
-        "from_colmap: quaternion must not be zero",
-    ),
-    "skew for PyTorch3D": (
-        lambda: cameras.to_pytorch3d(with_value("intrinsics", (0, 0, 0, 1), 0.5)),
-        CameraError,
-        "to_pytorch3d: cameras must have no skew",
-    ),
+    ShapeError: {
+        "Unproject: features must be (B, V, C, h, w) with B*V = 8 cameras; got (2, 3, 32, 56, 56), that is 6": lambda: (
+            unproject(torch.rand(2, 3, 32, 56, 56), right_cameras(2, 4))
+        ),
+        "Unproject: features must be (B, V, C, h, w) with B*V = 6 cameras; got (6, 4, 5, 7)": lambda: unproject(
+            torch.rand(6, 4, 5, 7)
+        ),
+        "cameras must have leading shape (B, V) = (3, 2), or (B*V,) with the view fastest; got (2, 3)": lambda: (
+            unproject(torch.rand(3, 2, 4, 5, 7))
+        ),
+        "got (2, 0, 4, 5, 7)": lambda: unproject(torch.rand(2, 0, 4, 5, 7), right_cameras(2, 0)),
+        "at least one view": lambda: sweep(views=right_cameras(2, 0)),
+        "cameras.cam_from_world must be (..., 4, 4), the whole world-to-camera matrix; got (2, 3, 3, 4)": lambda: (
+            unproject(views=VIEWS._replace(cam_from_world=VIEWS.cam_from_world[..., :3, :]))
+        ),
+        "Unproject: view_mask must be (B, V) = (2, 3); got (3, 2)": lambda: unproject(
+            view_mask=torch.ones(V, B, dtype=torch.bool)
+        ),
+        "Unproject: grid must have one pose and one row of depths, or as many as scenes, B = 2; got 3": lambda: (
+            functional.unproject(FEATURES, VIEWS, VoxelGrid(2, world_from_grid=torch.eye(4).expand(3, 4, 4)))
+        ),
+        "volume must be (B, C, D, H, W) with the grid's (D, H, W) = (6, 4, 3); got (2, 4, 3, 4, 6)": lambda: sweep(
+            grid=VoxelGrid((6, 4, 3))
+        ),
+        "depths must be (P,), (B, P) or (B, V, P) with (B, V) = (2, 3); got (3, 5)": lambda: sweep(
+            depths=DEPTHS.expand(3, 5)
+        ),
+        "camera must have leading shape () or (B,), one a scene (see cameras.select); got (2, 3)": lambda: FrustumGrid(
+            VIEWS, DEPTHS
+        ),
+        "PlaneSweepProject: size must be (h, w); got tuple (8,)": lambda: sweep(size=(8,)),
+        "unproject_points: points must be (B, N, 3) with B = 2; got (3, 5, 3)": lambda: functional.unproject_points(
+            FEATURES, VIEWS, torch.zeros(3, 5, 3)
+        ),
+    },
+    DTypeError: {
+        "Unproject: features must be of float16, bfloat16, float32, float64; got torch.uint8": lambda: unproject(
+            torch.ones(B, V, 3, 5, 7, dtype=torch.uint8)
+        ),
+        "cameras.intrinsics must be of float32, float64; got torch.float16": lambda: unproject(
+            views=VIEWS._replace(intrinsics=VIEWS.intrinsics.half())
+        ),
+        "of one dtype; got torch.float64 and torch.float32": lambda: unproject(
+            views=VIEWS._replace(intrinsics=VIEWS.intrinsics.double())
+        ),
+        "Unproject: view_mask must be a bool tensor (B, V); got a tensor (2, 3) of torch.float32": lambda: unproject(
+            view_mask=torch.ones(B, V)
+        ),
+        "Unproject: grid must be a VoxelGrid or a FrustumGrid; got a tensor (4, 4) of torch.float32": lambda: Unproject(
+            torch.rand(4, 4)
+        ),
+        "lower must be numbers (gradients go to world_from_grid); got a tensor (3,) of torch.float32": lambda: (
+            VoxelGrid(4, lower=torch.zeros(3))
+        ),
+    },
+    DeviceError: {
+        "Unproject: all tensors must be on one device; got features on meta, cameras on cpu": lambda: unproject(
+            FEATURES.to("meta")
+        ),
+    },
+    CameraError: {
+        "Unproject: cameras[1, 0]: intrinsics must be finite": lambda: unproject(
+            views=with_value("intrinsics", (1, 0, 0, 2), float("nan"))
+        ),
+        "Unproject: cameras[0, 2]: cam_from_world must be finite": lambda: unproject(
+            views=with_value("cam_from_world", (0, 2, 1, 3), float("inf"))
+        ),
+        "cameras[0, 1]: focal lengths must be positive pixels, 1e-6 of the image size at least; got -20": lambda: (
+            unproject(views=with_value("intrinsics", (0, 1, 1, 1), -20.0))
+        ),
+        "cameras[0, 1]: focal lengths must be positive pixels, 1e-6 of the image size at least; got 0": lambda: (
+            unproject(views=with_value("intrinsics", (0, 1, 0, 0), 0.0))
+        ),
+        "cameras[1, 1]: intrinsics must have the last row (0, 0, 1); its largest deviation is 1": lambda: unproject(
+            views=with_value("intrinsics", (1, 1, 2, 2), 2.0)
+        ),
+        "intrinsics must have the last row (0, 0, 1)": lambda: unproject(
+            views=VIEWS._replace(intrinsics=VIEWS.intrinsics.mT)
+        ),
+        "cameras[1, 1]: intrinsics[1, 0] must be 0; got 0.5": lambda: unproject(
+            views=with_value("intrinsics", (1, 1, 1, 0), 0.5)
+        ),
+        "cam_from_world must have the last row (0, 0, 0, 1)": lambda: unproject(
+            views=VIEWS._replace(cam_from_world=VIEWS.cam_from_world.mT)
+        ),
+        "cameras[1, 2]: the rotation must be orthonormal (a scale in it?); max |R^T R - I| is 0.21": lambda: unproject(
+            views=with_scale(rotation=1.1)
+        ),
+        "cameras[1, 2]: the rotation must not mirror (is an axis flipped?); its determinant is -1": lambda: unproject(
+            views=with_scale(first_row=-1.0)
+        ),
+        "Unproject: cameras.height must be at least 1 pixel": lambda: unproject(views=VIEWS._replace(height=0)),
+        "Unproject: cameras[0, 2]: height and width must be at least 1 pixel": lambda: unproject(
+            views=VIEWS._replace(width=torch.tensor([[14, 14, 0], [14, 14, 14]]))
+        ),
+        "from_colmap: quaternion must not be zero": lambda: cameras.from_colmap(
+            torch.eye(3), torch.zeros(4), torch.zeros(3), 4, 4
+        ),
+        "to_pytorch3d: cameras must have no skew": lambda: cameras.to_pytorch3d(
+            with_value("intrinsics", (0, 0, 0, 1), 0.5)
+        ),
+    },
+    OptionError: {
+        "Unproject: mode must be one of 'bilinear', 'nearest'; got str 'trilinear'": lambda: unproject(
+            mode="trilinear"
+        ),
+        "Unproject: padding_mode must be one of 'zeros', 'border'; got str 'reflection'": lambda: Unproject(
+            padding_mode="reflection"
+        ),
+        "Unproject: augment must be one of 'depth', 'direction'; got str 'color'": lambda: Unproject(
+            augment=("depth", "color")
+        ),
+        "Unproject: augment must not repeat a name; got ('depth', 'depth')": lambda: Unproject(
+            augment=("depth", "depth")
+        ),
+        "Unproject: reduce must be one of 'mean', 'variance', 'max'; got str 'median'": lambda: Unproject(
+            reduce="median"
+        ),
+        "Unproject: near must be a finite number, at least 0; got float -1.0": lambda: Unproject(near=-1.0),
+        "Unproject: backend must be one of 'auto', 'cpu', 'triton', 'reference'; got str 'cuda'": lambda: Unproject(
+            backend="cuda"
+        ),
+    },
+    GridError: {
+        "Unproject: grid must be given to the layer or to the call; got None": lambda: Unproject()(FEATURES, VIEWS),
+        "PlaneSweepProject: depths must be given to the layer or to the call; got None": lambda: PlaneSweepProject(
+            GRID
+        )(VOLUME, VIEWS),
+        "depths must be positive, finite and strictly ascending; got [3.0, 2.5, 2.0, 1.5, 1.0]": lambda: sweep(
+            depths=DEPTHS.flip(0)
+        ),
+        "depths must be positive, finite and strictly ascending; got [1.0, 1.0]": lambda: sweep(
+            depths=torch.tensor([[1.0, 2.0], [1.0, 1.0]])
+        ),
+        "FrustumGrid: depths must be positive, finite and strictly ascending; got [0.0, 1.0]": lambda: FrustumGrid(
+            right_cameras(B), torch.tensor([0.0, 1.0])
+        ),
+        "VoxelGrid: shape must be an int or (D, H, W), each at least 1; got (4, 0, 4)": lambda: VoxelGrid((4, 0, 4)),
+        "got (2048, 1024, 1024)": lambda: VoxelGrid((2**11, 2**10, 2**10)),
+        "VoxelGrid: lower must be below upper on every axis; got 0.0 and -1.0 in y": lambda: VoxelGrid(
+            4, (0, 0, 0), (1, -1, 1)
+        ),
+        "VoxelGrid: world_from_grid must be invertible": lambda: VoxelGrid(
+            4, world_from_grid=torch.diag(torch.tensor([1.0, 1.0, 0.0, 1.0]))
+        ),
+        "VoxelGrid: world_from_grid must be affine, its last row (0, 0, 0, 1)": lambda: VoxelGrid(
+            4, world_from_grid=torch.ones(4, 4)
+        ),
+        "depth_planes: near and far must be positive, finite and ascending; got 3.0 and 1.0": lambda: depth_planes(
+            3.0, 1.0, 4
+        ),
+        "depth_planes: num must be an integer": lambda: depth_planes(1.0, 3.0, 0),
+        "unproject_points: points must be finite": lambda: functional.unproject_points(
+            FEATURES, VIEWS, torch.full((B, 5, 3), torch.nan)
+        ),
+    },
 }
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_the_message(mistake):
-    call, kind, text = MISTAKES[mistake]
+@pytest.mark.parametrize(("kind", "text"), [(kind, text) for kind, calls in MISTAKES.items() for text in calls])
+def test_the_message(kind, text):
     with pytest.raises(kind, match=re.escape(text)):
-        call()
+        MISTAKES[kind][text]()
 
 
 WHOLE = {

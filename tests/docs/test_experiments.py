@@ -163,35 +163,6 @@ def kept(**changes):
     return values | changes
 
 
-def test_results_become_words():
-    assert collecting.headline(kept()) == "test IoU 30.0 41.1"
-    assert collecting.headline(kept(evaluation={})) == "validation IoU 31.0 42.0"
-    depth = kept(evaluation={"depth_error": {"1": {"mean": 0.0512}, "4": {"mean": None}}})
-    assert collecting.headline(depth) == "test depth error 0.0512 - (1, 4 views)"
-    trial = kept(evaluation={}, curve=[{"step": 3, "depth_error": {"1": 0.05, "2": None}}])
-    assert collecting.headline(trial) == "validation depth error 0.0500 -"
-
-
-def test_a_log_with_half_a_line_and_no_number_is_read(tmp_path):
-    lines = [
-        {"event": "start", "shapes": 8},
-        {"event": "evaluation", "step": 10, "iou": {"1": 0.1}, "loss": 0.5, "time": 1.0},
-        {"event": "evaluation", "step": 20, "iou": {"1": 0.2}, "loss": 0.5},
-        {"event": "resume"},
-        {"event": "evaluation", "step": 20, "iou": {"1": "nan"}, "loss": "inf"},
-    ]
-    text = (
-        "\n".join(json.dumps(line) for line in lines[:3]) + '\n{"event": "ev\n' + "\n".join(map(json.dumps, lines[3:]))
-    )
-    (tmp_path / "log.jsonl").write_text(text + "\n")
-    evaluations, start = collecting.read_log(tmp_path / "log.jsonl")
-    assert evaluations == [
-        {"step": 10, "iou": {"1": 0.1}, "loss": 0.5},
-        {"step": 20, "iou": {"1": None}, "loss": None},
-    ]
-    assert start["shapes"] == 8
-
-
 def test_results_become_tables_of_the_docs(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(running.RECIPE.parents[2] / "docs"))
     import model_tables

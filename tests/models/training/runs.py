@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
 from collections.abc import Collection
 from pathlib import Path
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -91,6 +93,24 @@ def assert_same_end(folder: Path, expected: Path) -> None:
     torch.testing.assert_close(weights, weights_there, rtol=0, atol=0)
     torch.testing.assert_close(moments, moments_there, rtol=0, atol=0)
     assert losses(folder).items() <= losses(expected).items()
+
+
+def assert_same_run(folder: Path, expected: Path) -> None:
+    """And the log of one tells of every step of the other."""
+    assert_same_end(folder, expected)
+    assert losses(folder).keys() == losses(expected).keys()
+
+
+def assert_same_learning(folder: Path, expected: Path) -> None:
+    """Losses, gradients and weights of two runs agree as sums in another order do."""
+    for ours, theirs in zip(events(folder, "step"), events(expected, "step"), strict=True):
+        for name in ("step", "loss", "gradient_norm", "learning_rate"):
+            assert ours[name] == pytest.approx(theirs[name], rel=2e-4), (name, ours["step"])
+    torch.testing.assert_close(end_of(folder)[1], end_of(expected)[1], rtol=1e-3, atol=1e-3)
+
+
+def changed(config: TrainingConfig, group: str, **settings: object) -> TrainingConfig:
+    return dataclasses.replace(config, **{group: dataclasses.replace(getattr(config, group), **settings)})
 
 
 def stop_in(monkeypatch, step: int) -> None:

@@ -18,43 +18,20 @@ import pytest
 import torch
 
 from lsmgeo.errors import CheckpointError, TrainingError
-from lsmgeo.models.training import RunConfig, TrainingConfig, loop, optimising
+from lsmgeo.models.training import RunConfig, loop, optimising
 from lsmgeo.models.training import logs as log_module
 from tests.models.training.faults import Points, fill, in_child, in_processes, kill, leftovers
-from tests.models.training.runs import assert_same_end, configure, end_of, events, losses, run, write_shapes
+from tests.models.training.runs import (
+    assert_same_end,
+    assert_same_run,
+    configure,
+    end_of,
+    events,
+    losses,
+    run,
+)
 
 KILLS = 14  # moments of a save at which a run is killed
-
-
-@pytest.fixture(scope="module")
-def config(tmp_path_factory) -> TrainingConfig:
-    return configure(write_shapes(tmp_path_factory.mktemp("shards")))
-
-
-@pytest.fixture(scope="module")
-def shards(config) -> Path:
-    return Path(config.data.source)
-
-
-@pytest.fixture(scope="module")
-def whole(config, tmp_path_factory) -> Path:
-    """A run of 6 steps, two epochs, that nothing happens to; it saves at 2, 4 and 6."""
-    folder = tmp_path_factory.mktemp("whole")
-    run(config, folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def half(shards, tmp_path_factory) -> Path:
-    """The first 2 steps of it."""
-    folder = tmp_path_factory.mktemp("half")
-    run(configure(shards, steps=2), folder)
-    return folder
-
-
-@pytest.fixture
-def begun(half, tmp_path) -> Path:
-    return shutil.copytree(half, tmp_path / "run")
 
 
 def ask(*_: object) -> None:
@@ -123,8 +100,7 @@ def test_a_run_killed_in_a_step_goes_on_as_if_it_had_not_been(config, whole, tmp
 
     assert in_child(killed) == -signal.SIGKILL
     run(config, tmp_path)
-    assert_same_end(tmp_path, whole)
-    assert losses(tmp_path) == losses(whole)
+    assert_same_run(tmp_path, whole)
 
 
 # F2: the disk is full
@@ -171,8 +147,7 @@ def test_a_save_without_room_is_tried_again(config, whole, begun, monkeypatch, a
     during_save(monkeypatch, 1, Points(fill, at))
     with pytest.warns(UserWarning, match=r"No space left on device.* the run goes on"):
         run(config, begun)
-    assert_same_end(begun, whole)
-    assert losses(begun) == losses(whole)
+    assert_same_run(begun, whole)
 
 
 def test_a_stop_right_after_a_failed_save_saves(config, whole, begun, monkeypatch):
@@ -220,8 +195,7 @@ def test_a_stop_in_a_save_ends_after_it(config, whole, begun, monkeypatch, at):
     assert (stopped.step, stopped.exit_code) == (4, 143)
     assert [line["step"] for line in events(begun, "checkpoint")] == [0, 2, 4]
     run(config, begun)
-    assert_same_end(begun, whole)
-    assert losses(begun) == losses(whole)
+    assert_same_run(begun, whole)
 
 
 def test_a_stop_while_waiting_for_data_does_not_wait(config, whole, begun, monkeypatch):
@@ -239,8 +213,7 @@ def test_a_stop_while_waiting_for_data_does_not_wait(config, whole, begun, monke
         stopped = run(config, begun)
     assert (stopped.step, stopped.exit_code) == (3, 143)
     run(config, begun)
-    assert_same_end(begun, whole)
-    assert losses(begun) == losses(whole)
+    assert_same_run(begun, whole)
 
 
 def test_a_second_signal_ends_a_save_at_once(config, whole, begun, monkeypatch):

@@ -1,6 +1,5 @@
 """What a run knows of itself when it goes on: its best, its beginning, the shapes it skipped."""
 
-import dataclasses
 import json
 import math
 import shutil
@@ -12,19 +11,10 @@ from lsmgeo.data import ShardSet
 from lsmgeo.data.shards.shape_transforms import resize_sample, resize_views
 from lsmgeo.errors import OptionError
 from lsmgeo.models import create, write_weights
-from lsmgeo.models.training import TrainingConfig, train
+from lsmgeo.models.training import train
 from lsmgeo.models.training.checkpoints import load_latest
 from lsmgeo.models.training.evaluating import Evaluation
-from tests.models.training.runs import SIZES, configure, run, write_shapes
-
-
-@pytest.fixture(scope="module")
-def shards(tmp_path_factory):
-    return write_shapes(tmp_path_factory.mktemp("shards"))
-
-
-def changed(config: TrainingConfig, group: str, **settings: object) -> TrainingConfig:
-    return dataclasses.replace(config, **{group: dataclasses.replace(getattr(config, group), **settings)})
+from tests.models.training.runs import SIZES, changed, configure, run
 
 
 def test_a_run_that_ends_by_the_clock_keeps_its_last_measure(shards, tmp_path):

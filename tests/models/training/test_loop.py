@@ -34,31 +34,9 @@ from lsmgeo.models.training import (
 from lsmgeo.models.training.checkpoints import load_latest
 from lsmgeo.models.training.feeding import Need, open_shapes, training_batches, validation_batches
 from tests.models.training import faults
-from tests.models.training.runs import configure, end_of, events, losses, run, write_shapes
+from tests.models.training.runs import assert_same_learning, configure, end_of, events, losses, run, write_shapes
 
 CPU = torch.device("cpu")
-
-
-@pytest.fixture(scope="module")
-def shards(tmp_path_factory):
-    return write_shapes(tmp_path_factory.mktemp("shards"))
-
-
-@pytest.fixture(scope="module")
-def plain(shards, tmp_path_factory):
-    """Three steps of four shapes."""
-    folder = tmp_path_factory.mktemp("plain")
-    run(configure(shards, steps=3, batch=4), folder)
-    return folder
-
-
-def assert_same_learning(folder, expected):
-    """Losses, gradients and weights of two runs agree as sums in another order do."""
-    for ours, theirs in zip(events(folder, "step"), events(expected, "step"), strict=True):
-        for name in ("step", "loss", "gradient_norm", "learning_rate"):
-            assert ours[name] == pytest.approx(theirs[name], rel=2e-4), (name, ours["step"])
-    (_, weights, _), (_, weights_there, _) = end_of(folder), end_of(expected)
-    torch.testing.assert_close(weights, weights_there, rtol=1e-3, atol=1e-3)
 
 
 def first_batches(config, count):
@@ -142,13 +120,6 @@ def test_the_loss_of_some_views(shards, tmp_path, loss_views):
     assert set(drawn) == ({-1} if loss_views == "last" else {0, 1})
     assert list(losses(tmp_path).values()) == pytest.approx(expected, rel=1e-6)
     assert of_every != pytest.approx(expected, rel=1e-5)
-
-
-def test_random_views_cover_all():
-    run_config = RunConfig(steps=1, loss_views="random")
-    drawn = [optimising.loss_steps(run_config, step, 4) for step in range(60)]
-    assert {index for steps in drawn for index in steps} == {0, 1, 2, 3}
-    assert drawn == [optimising.loss_steps(run_config, step, 4) for step in range(60)]
 
 
 def test_what_a_run_leaves(shards, tmp_path):
@@ -265,13 +236,6 @@ def test_minutes_count_over_resumes(shards, tmp_path, monkeypatch):
     trained = run(configure(shards, steps=3, minutes=minutes + 0.5), tmp_path)
     assert (trained.ended, trained.step) == ("steps", 3)
     assert load_latest(tmp_path).part("place")["seconds"] == pytest.approx(60 * minutes)
-
-
-def test_a_run_that_has_ended_has_nothing_to_do(shards, plain):
-    lines = len(events(plain, "step"))
-    trained = run(configure(shards, steps=3, batch=4), plain)
-    assert (trained.step, trained.ended, trained.evaluation) == (3, "steps", None)
-    assert len(events(plain, "step")) == lines
 
 
 def test_weights_to_begin_with(shards, plain, tmp_path):

@@ -40,37 +40,19 @@ FAULTS = {
     ),
     "depth without its slope": ("rows[2][s] += $float(by_height)$;", "0.0f"),
     "height's part forgotten": ("rows[2][s] = -($rows[0][s]$ * tile.index[0][s]", "0.0f"),
-    "inverse depth's part forgotten": (
-        "by_z[s] -= $double(by_plane) * tile.plane[row][s] * tile.depth[s]$;",
-        "0.0",
-    ),
+    "inverse depth's part forgotten": ("by_z[s] -= $double(by_plane) * tile.plane[row][s] * tile.depth[s]$;", "0.0"),
     "direction's slope not projected": (
         "($by_direction[row][s] - along * tile.direction[row][s]$)",
         "by_direction[row][s]",
     ),
-    "direction not normalised": (
-        "tile.shrink[s] = $away ? 1.0f / std::sqrt(away ? squares : 1.0f) : 0.0f$;",
-        "1.0f",
-    ),
-    "direction in y, z, x order": (
-        "*out++ = $tile.direction[row][s]$;",
-        "tile.direction[(row + 1) % 3][s]",
-    ),
+    "direction not normalised": ("tile.shrink[s] = $away ? 1.0f / std::sqrt(away ? squares : 1.0f) : 0.0f$;", "1.0f"),
+    "direction in y, z, x order": ("*out++ = $tile.direction[row][s]$;", "tile.direction[(row + 1) % 3][s]"),
     "mean over all views": ("mean += read<W>(values + v * step) * $share$;", "0.3333333f"),
     "blind views counted": ("if ($!tiles[v].visible[s]$) continue;\n        float *out", "false"),
-    "unbiased variance": (
-        "result += apart * apart * $share$;",
-        "1.0f / float(count > 1 ? count - 1 : 1)",
-    ),
-    "maximum's gradient to all views": (
-        "part = $taker == int32_t(v) ? gradient : Floats<W>{}$;",
-        "gradient",
-    ),
+    "unbiased variance": ("result += apart * apart * $share$;", "1.0f / float(count > 1 ? count - 1 : 1)"),
+    "maximum's gradient to all views": ("part = $taker == int32_t(v) ? gradient : Floats<W>{}$;", "gradient"),
     "mean's gradient not shared": ("Floats<W> part = gradient * $share$;", "1.0f"),
-    "first chunk's channels for all": (
-        "const S *source = source_of<S>(call, scene, view) + $channel$;",
-        "0",
-    ),
+    "first chunk's channels for all": ("const S *source = source_of<S>(call, scene, view) + $channel$;", "0"),
     "depths that saturate differentiated": (
         "geometric.by_distance[s] = $distance < LARGEST && distance <= limit ? *gradient : 0.0f$;",
         "*gradient",

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
+from typing import NamedTuple
 
 import pytest
 import torch
 
-from lsmgeo.kernels import Options, Sites, gpu, gpu_launch
+from lsmgeo.kernels import Options, Sites, gpu_launch
+from tests.kernels.triton_support import Points, by_kernels, deterministic
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
 
@@ -18,7 +21,7 @@ EVERY = ("mean", "variance", "max")
 
 FEATURES = torch.zeros(B, V, C, 24, 32)
 VOLUME = torch.zeros(B, C, 8, 16, 16)
-POINTS = torch.zeros(B, V, 100, 2), torch.ones(B, V, 100, dtype=torch.bool), torch.zeros(B, V, 4, 100)
+POINTS = Points(torch.zeros(B, V, 100, 2), torch.ones(B, V, 100, dtype=torch.bool), torch.zeros(B, V, 4, 100))
 
 
 class Hopper:
@@ -68,67 +71,56 @@ def sites(channel: str = "", projective: bool = False) -> Sites:
     return Sites(matrix, matrix if channel else None, x, x, 1.0 / (1.0 + x[:P]), projective, None)
 
 
-def images(dtype, options, projective=False):
-    source = FEATURES.to(dtype)
-    values, _ = gpu.images(source, sites(options.direction, projective), options)
-    gpu.images_backward(values, source, sites(options.direction, projective), options, (True,) * 4)
+class Variant(NamedTuple):
+    source: torch.Tensor
+    place: Sites | Points
+    options: Options
+    volume: bool = False
 
 
-def volume(dtype, options):
-    source = VOLUME.to(dtype)
-    values, _ = gpu.volume(source, sites(options.direction, True), options)
-    gpu.volume_backward(values, source, sites(options.direction, True), options, (True,) * 4)
+def images(options: Options, dtype: torch.dtype = torch.float32, projective: bool = False) -> Variant:
+    return Variant(FEATURES.to(dtype), sites(options.direction, projective), options)
 
 
-def pixels(dtype, options):
-    values, _ = gpu.pixels(FEATURES.to(dtype), *POINTS, options)
-    gpu.pixels_backward(values, FEATURES.to(dtype), *POINTS, options, (True,) * 3)
+def volume(options: Options, dtype: torch.dtype = torch.float32) -> Variant:
+    return Variant(VOLUME.to(dtype), sites(options.direction, True), options, volume=True)
 
 
-def fixed_point(dtype, options):
-    torch.use_deterministic_algorithms(True)
-    try:
-        images(dtype, options)
-    finally:
-        torch.use_deterministic_algorithms(False)
-
-
-def one_of_everything(dtype, options):
-    """Sizes of 1, which Triton takes for constants."""
-    one = torch.ones(1, dtype=torch.float64)
-    single = Sites(torch.ones(1, 1, 3, 4, dtype=torch.float64), None, one, one, one, False, None)
-    source = torch.zeros(1, 1, 1, 1, 1, dtype=dtype)
-    values, _ = gpu.images(source, single, options)
-    gpu.images_backward(values, source, single, options, (True,) * 4)
-
-
+ONE = torch.ones(1, dtype=torch.float64)
+BILINEAR = Options("bilinear")
 VARIANTS = {
-    "sizes of 1": (one_of_everything, torch.float32, Options("bilinear", reduce=("max",))),
-    "images": (images, torch.float32, Options("bilinear", **AUGMENTED)),
-    "frustums, nearest": (lambda *args: images(*args, True), torch.float16, Options("nearest", depth=True)),
-    "variance": (images, torch.bfloat16, Options("bilinear", "border", reduce=("variance",))),
-    "volume": (volume, torch.float32, Options("trilinear", "border")),
-    "pixels": (pixels, torch.float32, Options("bilinear")),
+    # Sizes of 1, which Triton takes for constants.
+    "sizes of 1": Variant(
+        torch.zeros(1, 1, 1, 1, 1),
+        Sites(torch.ones(1, 1, 3, 4, dtype=torch.float64), None, ONE, ONE, ONE, False, None),
+        Options("bilinear", reduce=("max",)),
+    ),
+    "images": images(Options("bilinear", **AUGMENTED)),
+    "frustums, nearest": images(Options("nearest", depth=True), torch.float16, projective=True),
+    "variance": images(Options("bilinear", "border", reduce=("variance",)), torch.bfloat16),
+    "volume": volume(Options("trilinear", "border")),
+    "pixels": Variant(FEATURES, POINTS, BILINEAR),
 }
 MORE = {
     "images, full tile": VARIANTS["images"],
     "volume, full tile": VARIANTS["volume"],
-    "mean": (images, torch.float32, Options("bilinear", reduce=("mean",))),
-    "maximum": (images, torch.float32, Options("nearest", reduce=("max",))),
-    "everything": (images, torch.float32, Options("bilinear", reduce=EVERY, **AUGMENTED)),
-    "everything, half": (images, torch.float16, Options("bilinear", "border", reduce=EVERY, **AUGMENTED)),
-    "stacked": (volume, torch.float32, Options("trilinear", stacked=True)),
-    "volume with channels": (volume, torch.float16, Options("trilinear", **AUGMENTED)),
-    "nearest cell": (volume, torch.bfloat16, Options("nearest", "border", depth=True)),
-    "pixels reduced": (pixels, torch.float16, Options("bilinear", "border", reduce=EVERY)),
-    "fixed point": (fixed_point, torch.float32, Options("bilinear")),
+    "mean": images(Options("bilinear", reduce=("mean",))),
+    "maximum": images(Options("nearest", reduce=("max",))),
+    "everything": images(Options("bilinear", reduce=EVERY, **AUGMENTED)),
+    "everything, half": images(Options("bilinear", "border", reduce=EVERY, **AUGMENTED), torch.float16),
+    "stacked": volume(Options("trilinear", stacked=True)),
+    "volume with channels": volume(Options("trilinear", **AUGMENTED), torch.float16),
+    "nearest cell": volume(Options("nearest", "border", depth=True), torch.bfloat16),
+    "pixels reduced": Variant(FEATURES.half(), POINTS, Options("bilinear", "border", reduce=EVERY)),
+    "fixed point": images(BILINEAR),
 }
 
 
 @pytest.mark.parametrize("variant", [*VARIANTS, *(pytest.param(name, marks=pytest.mark.long) for name in MORE)])
 def test_compiles_for_hopper(compiled, variant):
-    call, dtype, options = (VARIANTS | MORE)[variant]
-    call(dtype, options)
+    source, place, options, is_volume = (VARIANTS | MORE)[variant]
+    with deterministic() if variant == "fixed point" else contextlib.nullcontext():
+        by_kernels(source, place, options, volume=is_volume)
     assert [kernel.src.fn.__name__ for kernel in compiled] == ["resample", "resample_backward"]
     for kernel in compiled:
         assert len(kernel.asm["cubin"]) > 1000

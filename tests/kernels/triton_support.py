@@ -5,7 +5,9 @@ Judged by the reference in float64: the kernels may be a few times as far from i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -15,12 +17,21 @@ from lsmgeo._dtypes import computing_dtype, saturating_cast
 from lsmgeo.kernels import gpu, reference
 from lsmgeo.kernels.request import Options, Sites
 from lsmgeo.kernels.statistics import view_statistics
-from tests import tolerances
+from tests.kernels.comparison import assert_as_exact
 
 B, V = 1, 3  # scenes and views where a case says nothing else
 SHAPE = (2, 3, 4)  # D, H, W
 IMAGE = (5, 7)
 CELLS = (4, 5, 6)
+
+
+@contextlib.contextmanager
+def deterministic() -> Iterator[None]:
+    torch.use_deterministic_algorithms(True)
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(False)
 
 
 def generator(seed: int) -> torch.Generator:
@@ -33,8 +44,19 @@ def rotations(random: torch.Generator, *leading: int) -> Tensor:
     return q * torch.linalg.det(q)[..., None, None]
 
 
-def _z(random: torch.Generator, depths: Tensor, leading: Sequence[int]) -> Tensor:
-    return depths * (1.0 + 0.2 * torch.rand(*leading, 1, generator=random, dtype=torch.float64))
+def _sites(
+    random: torch.Generator, matrix: Tensor, direction: Tensor, shape: Sequence[int], z: Tensor, per: str, mask: bool
+) -> Sites:
+    """Sites of these depths, which are other ones in each scene or view where they are per it."""
+    x, y = (torch.arange(size, dtype=torch.float64) for size in shape[:0:-1])
+    leading = matrix.shape[: ("all", "scene", "view").index(per)]
+    if leading:
+        z = z * (1.0 + 0.2 * torch.rand(*leading, 1, generator=random, dtype=torch.float64))
+    view_mask = None
+    if mask:
+        view_mask = torch.ones(matrix.shape[:2], dtype=torch.bool)
+        view_mask[0, 0] = view_mask[-1, -1] = False
+    return Sites(matrix, direction, x, y, z, False, view_mask)
 
 
 def image_sites(
@@ -62,16 +84,10 @@ def image_sites(
         T = torch.cat((T[..., :2], T[..., 3:], T[..., 2:3]), -1)
         T[..., 3, :] = torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=torch.float64)
         z = 1.0 / torch.linspace(0.3, 1.4, D, dtype=torch.float64)
-    leading = {"all": (), "scene": (batch,), "view": (batch, views)}[per]
-    view_mask = None
-    if mask:
-        view_mask = torch.ones(batch, views, dtype=torch.bool)
-        view_mask[0, 0] = view_mask[-1, -1] = False
-    x, y = torch.arange(W, dtype=torch.float64), torch.arange(H, dtype=torch.float64)
     M = K @ (E @ T)
     center = -(E[..., :3].mT @ E[..., 3:])
     G = T[..., :3, :] - center * T[..., 3:, :]
-    return Sites(M, G, x, y, _z(random, z, leading) if leading else z, projective, view_mask)
+    return _sites(random, M, G, shape, z, per, mask)._replace(projective=projective)
 
 
 def sweep_sites(
@@ -93,14 +109,8 @@ def sweep_sites(
     M[..., 3] = turned[..., 2] - 0.5 * turned[..., 0] - 0.5 * turned[..., 1]
     M[..., 2] = 0.45 * torch.tensor(cells[::-1], dtype=torch.float64) - 1.1 * turned[..., 2]
     z = 1.0 / torch.linspace(0.5, 1.9, P, dtype=torch.float64)
-    leading = {"all": (), "scene": (batch,), "view": (batch, views)}[per]
-    view_mask = None
-    if mask:
-        view_mask = torch.ones(batch, views, dtype=torch.bool)
-        view_mask[0, 0] = False
     G = torch.randn(batch, views, 3, 4, generator=random, dtype=torch.float64)
-    x, y = torch.arange(w, dtype=torch.float64), torch.arange(h, dtype=torch.float64)
-    return Sites(M, G, x, y, _z(random, z, leading) if leading else z, True, view_mask)
+    return _sites(random, M, G, shape, z, per, mask)._replace(projective=True)
 
 
 def features(channels: int = 3, seed: int = 7, batch: int = B, views: int = V, dtype: Any = torch.float32) -> Tensor:
@@ -162,31 +172,24 @@ def by_reference(
     return values.detach(), visible, gradients
 
 
-def by_kernels(source: Tensor, place: Any, options: Options, cotangent: Tensor, **given: Any) -> Answer:
+def by_kernels(
+    source: Tensor,
+    place: Any,
+    options: Options,
+    cotangent: Tensor | None = None,
+    *,
+    volume: bool = False,
+    out: Tensor | None = None,
+) -> Answer:
+    """The kernels' answer and gradients; the cotangent is the answer itself if None."""
     needs = (True,) * 4
     if not isinstance(place, Sites):
         values, visible = gpu.pixels(source, *place, options)
-        return values, visible, list(gpu.pixels_backward(cotangent, source, *place, options, needs[:3]))
-    if options.mode == "trilinear" or given.get("volume"):
-        values, visible = gpu.volume(source, place, options, given.get("out"))
-        gradients = gpu.volume_backward(cotangent, source, place, options, needs, given.get("into"))
-    else:
-        values, visible = gpu.images(source, place, options)
-        gradients = gpu.images_backward(cotangent, source, place, options, needs)
-    return values, visible, list(gradients)
-
-
-def close(found: Tensor, expected: Tensor, single: Tensor, dtype: torch.dtype = torch.float32) -> None:
-    """Within a few times the error of the reference in float32, in the largest norm."""
-    assert found.shape == expected.shape, (found.shape, expected.shape)
-    if not expected.numel():
-        return
-    expected, single = expected.double(), single.double()
-    largest = float(expected.abs().max())
-    storage = 0.0 if dtype == torch.float32 else 2.0 * tolerances.UNIT_ROUNDOFF[dtype]
-    rounding = tolerances.VALUE_FACTOR * tolerances.UNIT_ROUNDOFF[torch.float32] + storage
-    atol = tolerances.FACTOR[torch.float32] * float((single - expected).abs().max()) + rounding * largest
-    torch.testing.assert_close(found.double(), expected, rtol=0, atol=atol)
+        back = gpu.pixels_backward(values if cotangent is None else cotangent, source, *place, options, needs[:3])
+        return values, visible, list(back)
+    values, visible = gpu.volume(source, place, options, out) if volume else gpu.images(source, place, options)
+    backward = gpu.volume_backward if volume else gpu.images_backward
+    return values, visible, list(backward(values if cotangent is None else cotangent, source, place, options, needs))
 
 
 def compare(
@@ -195,10 +198,9 @@ def compare(
     options: Options,
     *,
     cotangent: Tensor | None = None,
-    seed: int = 5,
     volume: bool = False,
     seen: bool = True,
-    **given: Any,
+    out: Tensor | None = None,
 ) -> Answer:
     """Require values, visibility and every gradient to be the reference's; returns what the kernels gave.
 
@@ -207,10 +209,9 @@ def compare(
         place: `Sites`, or `Points`.
         options: of the call.
         cotangent: the incoming gradient; random if None.
-        seed: of the cotangent.
         volume: whether the sites are frustums.
         seen: require that some sites are visible and some are not.
-        **given: to the kernels.
+        out: where the kernels write a volume's values.
     """
     operator: Any = reference.plane_sweep_project if volume else reference.unproject
     if not isinstance(place, Sites):
@@ -219,22 +220,26 @@ def compare(
     with torch.no_grad():
         shape = operator(source, place, plain)[0].shape
     if cotangent is None:
-        cotangent = torch.randn(shape, generator=generator(seed)).to(source.dtype)
+        cotangent = torch.randn(shape, generator=generator(5)).to(source.dtype)
     values, visible, gradients = by_reference(operator, source.float(), place, plain, cotangent.float())
     exact, _, derivatives = by_reference(operator, source.double(), place, plain, cotangent.double())
-    found = by_kernels(source, place, options, cotangent, volume=volume, **given)
+    found = by_kernels(source, place, options, cotangent, volume=volume, out=out)
+    half = source.dtype != torch.float32
     if seen and (bool(visible.all()) or not bool(visible.any())):
         raise ValueError("a scene of which everything is visible, or nothing, tells little")
     torch.testing.assert_close(found[1], visible, rtol=0, atol=0)
-    close(found[0], exact, values, source.dtype)
+    # The interpreter cuts off what bfloat16 does not hold.
+    assert_as_exact("values", found[0], values, exact, half=half, rounding=2.0)
     assert len(found[2]) == len(derivatives)
-    assert found[2][0] is None or found[2][0].dtype == (
-        torch.float32 if given.get("into") is not None else source.dtype
-    )
+    assert found[2][0] is not None
+    assert found[2][0].dtype == source.dtype
     for place_of, (gradient, expected, single) in enumerate(zip(found[2], derivatives, gradients, strict=True)):
         if expected is None or single is None:  # does not depend on it
             assert gradient is None or not bool(gradient.any())
-        elif place_of or given.get("into") is None:
+        else:
             assert gradient is not None
-            close(gradient, expected, single, source.dtype)
+            assert_as_exact(f"gradient {place_of}", gradient, single, expected, half=half)
     return found
+
+
+compare_sweep = functools.partial(compare, volume=True)

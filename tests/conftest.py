@@ -35,7 +35,10 @@ NOT_COUNTED = ("tests/fuzz/test_junk.py", "tests/interop/test_compile.py")
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     counted, not_counted = ([config.rootpath / name for name in names] for names in (COUNTED, NOT_COUNTED))
+    without_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
     for item in items:
+        if item.get_closest_marker("gpu"):
+            item.add_marker(without_gpu)
         path = Path(item.path)
         if path in not_counted or not any(path.is_relative_to(folder) for folder in counted):
             item.add_marker("no_cover")

@@ -92,14 +92,18 @@ R, T = E[..., :3, :3].clone(), E[..., :3, 3].clone()
 IMAGE_SIZE = {"height": 12, "width": 14}
 COMMON = {name: value for name, value in SAMPLING.items() if name != "view_mask"}
 
+LIFTED = {"features": FEATURES, "cameras": VIEWS, "grid": GRID}
+SWEEP = {"volume": VOLUME, "cameras": VIEWS, "grid": GRID, "depths": DEPTHS}
+BLOCKS = {"volume": torch.rand(B, V, C, 11), "visible": torch.rand(B, V, 11) > 0.3}
+# The call of a layer goes before what it is made from.
+CALLED = {"cameras": VIEWS, "view_mask": MASK}
+PLANES = {"grid": GRID, "depths": DEPTHS, "size": MAP}
+
 CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "unproject": (_unproject, {"features": FEATURES, **VIEWS._asdict(), "grid": GRID, **IMAGE}),
-    "unproject of cameras": (functional.unproject, {"features": FEATURES, "cameras": VIEWS, "grid": GRID}),
-    "unproject with reduce": (
-        functional.unproject,
-        {"features": FEATURES, "cameras": VIEWS, "grid": GRID, "reduce": "max", "near": 0.1, "view_mask": MASK},
-    ),
-    "unproject_slabs": (_slabs, {"features": FEATURES, "cameras": VIEWS, "grid": GRID, "planes": 2, "view_mask": MASK}),
+    "unproject of cameras": (functional.unproject, LIFTED),
+    "unproject with reduce": (functional.unproject, {**LIFTED, "reduce": "max", "near": 0.1, "view_mask": MASK}),
+    "unproject_slabs": (_slabs, {**LIFTED, "planes": 2, "view_mask": MASK}),
     "unproject_points": (
         functional.unproject_points,
         {"features": FEATURES, "cameras": VIEWS, "points": torch.rand(B, 11, 3) - 0.5, **IMAGE},
@@ -114,73 +118,24 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
             **{name: IMAGE[name] for name in ("mode", "padding_mode", "augment", "reduce", "near", "backend")},
         },
     ),
-    "plane_sweep_project": (
-        functional.plane_sweep_project,
-        {"volume": VOLUME, "cameras": VIEWS, "grid": GRID, "depths": DEPTHS, "size": MAP, "flatten": True, **SWEPT},
-    ),
-    "view_statistics": (
-        functional.view_statistics,
-        {
-            "volume": torch.rand(B, V, C, 11),
-            "visible": torch.rand(B, V, 11) > 0.3,
-            "statistics": ("mean", "max"),
-            "view_mask": MASK,
-        },
-    ),
+    "plane_sweep_project": (functional.plane_sweep_project, {**SWEEP, "size": MAP, "flatten": True, **SWEPT}),
+    "view_statistics": (functional.view_statistics, {**BLOCKS, "statistics": ("mean", "max"), "view_mask": MASK}),
     "Unproject": (
         _layer(Unproject, 3),
-        {
-            "features": FEATURES,
-            "cameras": VIEWS,
-            "view_mask": MASK,
-            "grid": GRID,
-            "mode": "bilinear",
-            "reduce": None,
-            **COMMON,
-        },
+        {"features": FEATURES, **CALLED, "grid": GRID, "mode": "bilinear", "reduce": None, **COMMON},
     ),
     "PlaneSweepProject": (
         _layer(PlaneSweepProject, 3),
-        {
-            "volume": VOLUME,
-            "cameras": VIEWS,
-            "view_mask": MASK,
-            "grid": GRID,
-            "depths": DEPTHS,
-            "size": MAP,
-            "flatten": True,
-            "mode": "trilinear",
-            **COMMON,
-        },
+        {"volume": VOLUME, **CALLED, **PLANES, "flatten": True, "mode": "trilinear", **COMMON},
     ),
     "ProjectReduce": (
         _layer(rays.ProjectReduce, 3),
-        {
-            "volume": VOLUME,
-            "cameras": VIEWS,
-            "view_mask": MASK,
-            "in_channels": C,
-            "out_channels": 2,
-            "grid": GRID,
-            "depths": DEPTHS,
-            "size": MAP,
-            "bias": True,
-            "mode": "trilinear",
-            **COMMON,
-        },
+        {"volume": VOLUME, **CALLED, "in_channels": C, "out_channels": 2, **PLANES, "bias": True, "mode": "trilinear"}
+        | COMMON,
     ),
     "project_reduce": (
         rays.project_reduce,
-        {
-            "volume": VOLUME,
-            "cameras": VIEWS,
-            "grid": GRID,
-            "depths": DEPTHS,
-            "weight": torch.rand(2, C * P),
-            "bias": torch.rand(2),
-            "size": MAP,
-            **SWEPT,
-        },
+        {**SWEEP, "weight": torch.rand(2, C * P), "bias": torch.rand(2), "size": MAP, **SWEPT},
     ),
     "expected_depth": (rays.expected_depth, {"scores": SCORES, "depths": DEPTHS, "visible": SEEN}),
     "max_along_rays": (rays.max_along_rays, {"maps": SCORES, "visible": SEEN}),
@@ -188,10 +143,7 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         rays.composite,
         {"alpha": torch.rand(B, P, *MAP), "values": torch.rand(B, C, P, *MAP), "depths": DEPTHS, "visible": SEEN},
     ),
-    "Mean": (
-        _layer(fusion.Mean, 3),
-        {"volume": torch.rand(B, V, C, 11), "visible": torch.rand(B, V, 11) > 0.3, "view_mask": MASK},
-    ),
+    "Mean": (_layer(fusion.Mean, 3), {**BLOCKS, "view_mask": MASK}),
     "VoxelGrid": (_grid, {"shape": SHAPE, "lower": (-1.0, -2.0, -3.0), "upper": 1.0, "world_from_grid": torch.eye(4)}),
     "FrustumGrid": (_frustum, {"camera": right_cameras(B), "depths": DEPTHS, "size": MAP}),
     "depth_planes": (depth_planes, {"near": 1.0, "far": 3.0, "num": P, "spacing": "log"}),
@@ -205,14 +157,8 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     ),
     "orbit": (
         cameras.orbit,
-        {
-            "azimuth": torch.rand(B),
-            "elevation": 20.0,
-            "distance": torch.tensor(2.0),
-            "focal_length": 20.0,
-            **IMAGE_SIZE,
-            "target": (0.0, 0.0, 0.0),
-        },
+        {"azimuth": torch.rand(B), "elevation": 20.0, "distance": torch.tensor(2.0), "focal_length": 20.0}
+        | {**IMAGE_SIZE, "target": (0.0, 0.0, 0.0)},
     ),
     "perturb": (cameras.perturb, {"cameras": VIEWS, "degrees": 2.0, "target": torch.zeros(3), "generator": None}),
     "rays": (cameras.rays, {"cameras": VIEWS, "size": MAP}),
@@ -227,28 +173,18 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     ),
     "from_colmap": (
         cameras.from_colmap,
-        {
-            "intrinsics": K,
-            "quaternion": torch.rand(B, V, 4) + 0.1,
-            "translation": T,
-            **IMAGE_SIZE,
-            "pixel_center": "half",
-        },
+        {"intrinsics": K, "quaternion": torch.rand(B, V, 4) + 0.1, "translation": T}
+        | {**IMAGE_SIZE, "pixel_center": "half"},
     ),
     "from_pytorch3d": (
         cameras.from_pytorch3d,
-        {
-            "R": R,
-            "T": T,
-            "focal_length": torch.rand(B, V, 2) + 1.0,
-            "principal_point": torch.rand(B, V, 2),
-            **IMAGE_SIZE,
-            "in_ndc": True,
-        },
+        {"R": R, "T": T, "focal_length": torch.rand(B, V, 2) + 1.0, "principal_point": torch.rand(B, V, 2)}
+        | {**IMAGE_SIZE, "in_ndc": True},
     ),
-    "to_opencv": (cameras.to_opencv, {"cameras": VIEWS, "pixel_center": "half"}),
-    "to_opengl": (cameras.to_opengl, {"cameras": VIEWS, "pixel_center": "half"}),
-    "to_colmap": (cameras.to_colmap, {"cameras": VIEWS, "pixel_center": "half"}),
+    **{
+        f"to_{tool}": (getattr(cameras, f"to_{tool}"), {"cameras": VIEWS, "pixel_center": "half"})
+        for tool in ("opencv", "opengl", "colmap")
+    },
     "to_pytorch3d": (cameras.to_pytorch3d, {"cameras": VIEWS, "in_ndc": False}),
     "explain": (_explain, {"operator": "unproject", "source": FEATURES, "mode": "nearest", "reduce": "mean"}),
 }

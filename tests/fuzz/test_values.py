@@ -58,7 +58,6 @@ class TestDebug:
         torch.testing.assert_close(inside, unproject(), rtol=0, atol=0)
 
     @pytest.mark.gpu
-    @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
     def test_values_on_a_gpu_are_checked_in_the_context_alone(self):
         bad = cameras.to(with_value("intrinsics", (1, 0, 0, 2), float("nan")), "cuda")
         volume, _ = unproject(FEATURES.cuda(), bad)

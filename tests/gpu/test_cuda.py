@@ -10,10 +10,7 @@ import torch
 from lsmgeo import FrustumGrid, VoxelGrid, depth_planes, functional
 from lsmgeo.cameras import CameraTensors, orbit, to
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-]
+pytestmark = pytest.mark.gpu
 
 VIEWS = orbit(torch.tensor([[0.0, 40.0, 80.0], [10.0, 50.0, 200.0]]), 10.0, 2.0, focal_length=50.0, height=24, width=32)
 FEATURES = torch.rand(2, 3, 4, 12, 16, generator=torch.Generator().manual_seed(0))

@@ -9,10 +9,7 @@ from lsmgeo import scenes
 from lsmgeo.cameras import orbit, to
 from lsmgeo.scenes import synthetic13
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-]
+pytestmark = pytest.mark.gpu
 
 
 @pytest.mark.parametrize("precision", ["highest", "high"])

@@ -82,25 +82,19 @@ def _everything_in_front_is_visible(inner, source, index, front, call):
     return values, front.expand(visible.shape)
 
 
-def _no_depth_test(inner, source, homogeneous, unit, mask, call):
-    x, y, z = homogeneous
-    safe = torch.where(z == 0, 1.0, z)
-    front = torch.ones_like(z, dtype=torch.bool)
-    if mask is not None:
-        front = front & mask.reshape(*mask.shape, *(1,) * (z.dim() - 2))
-    index = [torch.where(front, axis / safe, reference.OUTSIDE) for axis in (x, y)]
-    values, visible = reference._sample(source, index, front, call)
-    return values, visible, inner(source, homogeneous, unit, mask, call)[2]
+def _divided(is_front, divisor):
+    """Sampling with other rules of what is in front and of what is divided by."""
 
+    def sample(inner, source, homogeneous, unit, mask, call):
+        x, y, z = homogeneous
+        front = is_front(z, call.near * unit)
+        if mask is not None:
+            front = front & mask.reshape(*mask.shape, *(1,) * (z.dim() - 2))
+        index = [torch.where(front, axis / divisor(z), reference.OUTSIDE) for axis in (x, y)]
+        values, visible = reference._sample(source, index, front, call)
+        return values, visible, inner(source, homogeneous, unit, mask, call)[2]
 
-def _naive_division(inner, source, homogeneous, unit, mask, call):
-    x, y, z = homogeneous
-    front = z > call.near * unit
-    if mask is not None:
-        front = front & mask.reshape(*mask.shape, *(1,) * (z.dim() - 2))
-    index = [torch.where(front, axis / z, reference.OUTSIDE) for axis in (x, y)]
-    values, visible = reference._sample(source, index, front, call)
-    return values, visible, inner(source, homogeneous, unit, mask, call)[2]
+    return around(reference._sample_through_cameras, sample)
 
 
 def _depth_plus_epsilon(inner, source, homogeneous, unit, mask, call):
@@ -287,13 +281,15 @@ FAULTS = {
     "zeros always": options(BOTH, padding_mode="zeros"),
     "derivative of the cell below at integers": _coordinate(_lower_cell),
     # visibility
-    "no depth test": around(reference._sample_through_cameras, _no_depth_test),
+    "no depth test": _divided(
+        lambda z, near: torch.ones_like(z, dtype=torch.bool), lambda z: torch.where(z == 0, 1.0, z)
+    ),
     "near plane ignored": options(BOTH, near=0.0),
     "everything in front counts as visible": around(reference._sample, _everything_in_front_is_visible),
     "far image border counts as visible": around(reference._sample, _closed_image),
     "outer half pixel counts as invisible": around(reference._sample, _centres_only),
     "hidden samples masked by multiplication": around(reference._sample, _sample_unmasked),
-    "division before the guard": around(reference._sample_through_cameras, _naive_division),
+    "division before the guard": _divided(lambda z, near: z > near, lambda z: z),
     "view mask ignored": both(*(around(reference.OPERATORS[name], _unmasked) for name in BOTH)),
     # geometric channels
     "ray length for depth": both(

@@ -133,7 +133,6 @@ LAWS = (
         test_view_statistics.test_statistics_are_the_oracles_after_augmentation,
         (_SCENE, st.just(("variance", "max", "mean")), test_view_statistics.CALLS, st.just(False)),
     ),
-    Law(test_gradients.test_unproject_gradients_to_features_k_r_t_and_grid_pose, fixed=((0,),)),
-    Law(test_gradients.test_sweep_gradients_to_volume_k_r_t_grid_pose_and_depths, fixed=((0,),)),
+    Law(test_gradients.test_gradients_to_every_input, fixed=((0, "grid"), (0, "sweep"))),
     Law(test_layout.test_one_pixel_one_voxel_one_plane, fixed=_DTYPES),
 )

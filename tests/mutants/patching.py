@@ -8,6 +8,7 @@ import functools
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any
+from unittest import mock
 
 import torch
 from torch import Tensor
@@ -17,18 +18,12 @@ from lsmgeo.cameras import matrices
 from lsmgeo.kernels import reference
 
 
-@contextlib.contextmanager
-def reference_alone() -> Iterator[None]:
+def reference_alone() -> contextlib.AbstractContextManager[Any]:
     """Take the reference in every call: the faults here are in it. Those of other kernels have tables of their own."""
-    before = kernels.BACKENDS
-    kernels.BACKENDS = tuple(backend for backend in before if backend.name == "reference")
-    try:
-        yield
-    finally:
-        kernels.BACKENDS = before
+    return mock.patch.object(kernels, "BACKENDS", tuple(b for b in kernels.BACKENDS if b.name == "reference"))
 
 
-Patch = Callable[[], contextlib.AbstractContextManager[None]]
+Patch = Callable[[], contextlib.AbstractContextManager[Any]]
 
 
 @contextlib.contextmanager
@@ -54,19 +49,11 @@ def replaced(original: Any, make: Callable[[Any], Any]) -> Iterator[None]:
             reference.OPERATORS[key] = original
 
 
-@contextlib.contextmanager
-def attribute(owner: Any, name: str, make: Callable[[Any], Any]) -> Iterator[None]:
+def attribute(owner: Any, name: str, make: Callable[[Any], Any]) -> contextlib.AbstractContextManager[Any]:
     """Replace an attribute of a class by ``make(original)``; properties too."""
     original = vars(owner)[name]
-    if isinstance(original, property):
-        substitute: Any = property(make(original.fget))
-    else:
-        substitute = make(original)
-    setattr(owner, name, substitute)
-    try:
-        yield
-    finally:
-        setattr(owner, name, original)
+    made = property(make(original.fget)) if isinstance(original, property) else make(original)
+    return mock.patch.object(owner, name, made)
 
 
 def around(original: Any, wrapper: Callable[..., Any]) -> Patch:

@@ -132,44 +132,28 @@ OPTIONS = [
 ]
 
 
-def check_gradients(operator, setup, number, arguments):
+OPERATORS = {
+    "grid": (unproject, lambda setup: (setup.features, setup.pinhole, setup.spin, setup.shift, setup.pose)),
+    "frustum": (unproject_frustum, lambda setup: (setup.features, setup.pinhole, setup.spin, setup.shift, PLANES)),
+    "points": (unproject_points, lambda setup: (setup.features, setup.pinhole, setup.spin, setup.shift, setup.points)),
+    "sweep": (plane_sweep, lambda setup: (setup.volume, setup.pinhole, setup.spin, setup.shift, setup.pose, PLANES)),
+}
+
+
+@pytest.mark.parametrize("kind", OPERATORS)
+@pytest.mark.parametrize("number", range(len(OPTIONS)))
+def test_gradients_to_every_input(number, kind):
     """The first options entry by entry, the others along random directions."""
+    operator, inputs = OPERATORS[kind]
+    setup = smooth_setup(kind, number)
     call = functools.partial(operator, setup, **OPTIONS[number])
-    assert torch.autograd.gradcheck(call, arguments, fast_mode=number > 0)
-
-
-@pytest.mark.parametrize("number", range(len(OPTIONS)))
-def test_unproject_gradients_to_features_k_r_t_and_grid_pose(number):
-    setup = smooth_setup("grid", number)
-    arguments = leaves(setup.features, setup.pinhole, setup.spin, setup.shift, setup.pose)
-    check_gradients(unproject, setup, number, arguments)
-
-
-@pytest.mark.parametrize("number", range(len(OPTIONS)))
-def test_frustum_gradients_to_features_k_r_t_and_depths(number):
-    setup = smooth_setup("frustum", number)
-    arguments = leaves(setup.features, setup.pinhole, setup.spin, setup.shift, PLANES)
-    check_gradients(unproject_frustum, setup, number, arguments)
-
-
-@pytest.mark.parametrize("number", range(len(OPTIONS)))
-def test_point_gradients_to_features_k_r_t_and_points(number):
-    setup = smooth_setup("points", number)
-    arguments = leaves(setup.features, setup.pinhole, setup.spin, setup.shift, setup.points)
-    check_gradients(unproject_points, setup, number, arguments)
-
-
-@pytest.mark.parametrize("number", range(len(OPTIONS)))
-def test_sweep_gradients_to_volume_k_r_t_grid_pose_and_depths(number):
-    setup = smooth_setup("sweep", number)
-    arguments = leaves(setup.volume, setup.pinhole, setup.spin, setup.shift, setup.pose, PLANES)
-    check_gradients(plane_sweep, setup, number, arguments)
+    assert torch.autograd.gradcheck(call, leaves(*inputs(setup)), fast_mode=number > 0)
 
 
 @pytest.mark.parametrize("reduce", ["mean", "variance", ("max", "mean")])
 def test_reduced_gradients(reduce):
     setup = smooth_setup("grid", 3)
-    arguments = leaves(setup.features, setup.pinhole, setup.spin, setup.shift, setup.pose)
+    arguments = leaves(*OPERATORS["grid"][1](setup))
     call = functools.partial(unproject, setup, padding_mode="border", reduce=reduce)
     assert torch.autograd.gradcheck(call, arguments, fast_mode=True)
 

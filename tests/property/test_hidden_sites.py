@@ -151,23 +151,3 @@ def test_masked_views_are_unread_and_unchecked(scene):
     for leaf in (features, cameras.intrinsics, cameras.cam_from_world):
         assert bool(leaf.grad.isfinite().all())
         support.assert_same(leaf.grad[~mask], torch.zeros_like(leaf.grad[~mask]))
-
-
-def test_masked_views_are_dropped_from_the_sweep():
-    @support.FEWER
-    @given(scenes(placements=("facing", "inside")))
-    def check(scene):
-        mask = torch.from_numpy(scene.view_mask)
-        volume = torch.from_numpy(scene.volume).requires_grad_()
-        _, cameras, grid = support.inputs(scene)
-        depths = torch.tensor([0.5, 1.0, 2.5], dtype=torch.float64)
-        options = {"flatten": False, **EVERYTHING}
-        expected, expected_visible = functional.plane_sweep_project(volume, cameras, grid, depths, (3, 4), **options)
-        poisoned = cameras._replace(intrinsics=torch.where(mask[..., None, None], cameras.intrinsics, torch.nan))
-        maps, visible = functional.plane_sweep_project(
-            volume, poisoned, grid, depths, (3, 4), view_mask=mask, **options
-        )
-        support.assert_same(maps, torch.where(mask[..., None, None, None, None], expected, 0.0))
-        support.assert_same(visible, expected_visible & mask[..., None, None, None])
-
-    check()

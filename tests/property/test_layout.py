@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given
-from hypothesis import strategies as st
 
 from lsmgeo import CameraTensors, FrustumGrid, VoxelGrid, functional
-from lsmgeo.errors import ShapeError
-from tests import tolerances
 from tests.property import support
 from tests.property.test_unproject import OPTIONS, plain_camera
 from tests.strategies import scenes
@@ -116,34 +113,6 @@ def test_camera_dtype_is_free(features_dtype, cameras_dtype):
     support.assert_known(values, torch.full((1, 1, 1, 1), 1.25, dtype=features_dtype))
 
 
-@pytest.mark.parametrize(("batch", "channels"), [(0, 2), (2, 0), (0, 0)])
-def test_no_scenes_and_no_channels_give_empty_answers(batch, channels):
-    features = torch.zeros(batch, 3, channels, 4, 5, requires_grad=True)
-    cameras = CameraTensors(
-        *(field.expand(batch, 3, *field.shape[2:]) for field in plain_camera(torch.float32, (4, 5)))
-    )
-    volume, visible = functional.unproject(features, cameras, VoxelGrid((2, 3, 4)), augment=("depth",))
-    assert volume.shape == (batch, 3, channels + 1, 2, 3, 4)
-    assert visible.shape == (batch, 3, 2, 3, 4)
-    volume.sum().backward()
-    assert features.grad.shape == features.shape
-    reduced, _ = functional.unproject(features, cameras, VoxelGrid((2, 3, 4)), reduce=("mean", "max"))
-    assert reduced.shape == (batch, 2 * channels, 2, 3, 4)
-    source = torch.zeros(batch, channels, 2, 3, 4, requires_grad=True)
-    maps, seen = functional.plane_sweep_project(source, cameras, VoxelGrid((2, 3, 4)), torch.ones(1), (6, 7))
-    assert maps.shape == (batch, 3, channels, 6, 7)
-    assert seen.shape == (batch, 3, 1, 6, 7)
-    maps.sum().backward()
-    points, _ = functional.unproject_points(features, cameras, torch.zeros(batch, 0, 3))
-    assert points.shape == (batch, 3, channels, 0)
-
-
-def test_no_view_is_an_error():
-    cameras = CameraTensors(*(field[:, :0] for field in plain_camera(torch.float32, (4, 5))))
-    with pytest.raises(ShapeError, match="V"):
-        functional.unproject(torch.zeros(1, 0, 2, 4, 5), cameras, VoxelGrid(2))
-
-
 @pytest.mark.parametrize("dtype", support.DTYPES)
 def test_one_pixel_one_voxel_one_plane(dtype):
     camera = plain_camera(dtype, (1, 1))
@@ -163,15 +132,3 @@ def test_one_pixel_one_voxel_one_plane(dtype):
     frustum = FrustumGrid(CameraTensors(*(field[0, 0] for field in camera)), torch.ones(1, dtype=dtype), (1, 1))
     values, _ = functional.unproject(torch.full((1, 1, 1, 1, 1), 5.0, dtype=dtype), camera, frustum)
     support.assert_known(values, five)
-
-
-@support.FEWER
-@given(scenes(), st.sampled_from(("bilinear", "nearest")))
-def test_cameras_may_be_flat_or_kornias(scene, mode):
-    """(B, V), (B*V,) with the view fastest, a PinholeCamera, and its (B, V, 4, 4) storage name the same cameras."""
-    features, cameras, grid = support.inputs(scene)
-    expected, _ = functional.unproject(features, cameras, grid, mode=mode)
-    flat = CameraTensors(*(field.flatten(0, 1) for field in cameras))
-    for same in (flat, flat.to_kornia(), CameraTensors.from_kornia(flat.to_kornia())):
-        volume, _ = functional.unproject(features, same, grid, mode=mode)
-        support.assert_within(support.array(volume), support.array(expected), tolerances.FRAME)

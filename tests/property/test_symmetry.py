@@ -5,14 +5,12 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lsmgeo import functional
 from lsmgeo.cameras import resize
-from lsmgeo.errors import CameraError
 from tests import tolerances
 from tests.property import support
 from tests.property.test_unproject import OPTIONS, pixel_ramp
@@ -125,15 +123,6 @@ def test_scaling_the_world_scales_depth_alone(scene, scale):
     np.testing.assert_array_equal(visible[certain], other_visible[certain])
     support.assert_within(other[:, :, :-1], values[:, :, :-1], np.where(certain, bound, 2.0)[:, :, None])
     support.assert_within(other[:, :, -1], scale * values[:, :, -1], scale * tolerances.FRAME)
-
-
-def test_scaled_intrinsics_are_rejected():
-    """P17: the last row of K is (0, 0, 1)."""
-    features, grid = torch.zeros(1, 1, 1, 4, 4), support.VoxelGrid(2)
-    eye = torch.eye(4)[None, None]
-    cameras = support.CameraTensors(2.0 * eye[..., :3, :3], eye, torch.tensor([[4]]), torch.tensor([[4]]))
-    with pytest.raises(CameraError, match="intrinsics"):
-        functional.unproject(features, cameras, grid)
 
 
 @given(scenes(), OPTIONS, st.integers(1, 4))

@@ -47,7 +47,9 @@ MAY_ALSO_IMPORT = {
     "metrics": set(),
     "drawing": {"data"},
     "diagnosis": {"data", "drawing"},
+    "classical": {"data", "scenes", "drawing"},
     "models": {"data", "scenes", "metrics", "drawing", "classical"},
+    "demo": {"data", "scenes", "drawing", "classical"},
 }
 NETWORKS = {"blocks", "creating", "depth_lsm", "losses", "outputs", "r2n2", "settings", "voxel_lsm"}
 HEAVY = {"cv2", "trimesh", "skimage", "matplotlib", "jsonargparse", "triton", "scipy", "tqdm", "PIL"}
@@ -99,15 +101,9 @@ def test_the_core_imports_along_the_arrows(module):
 
 
 @pytest.mark.parametrize("module", [module for module in MODULES if part(module) in MAY_ALSO_IMPORT])
-def test_data_and_scenes_stand_below_models(module):
+def test_what_is_outside_the_core_imports_along_its_arrows(module):
     own = {part(name) for name in imported(MODULES[module], module) if name.split(".")[0] == "lsmgeo"}
     assert own & OUTSIDE_THE_CORE <= MAY_ALSO_IMPORT[part(module)] | {part(module)}
-
-
-def test_the_models_stand_above_all_but_the_command_line():
-    for module, path in MODULES.items():
-        if part(module) not in ("models", "cli", "commands"):
-            assert not any(name.startswith("lsmgeo.models") for name in imported(path, module)), module
 
 
 def test_the_networks_know_nothing_of_training():
@@ -125,14 +121,6 @@ def test_scenes_and_data_import_lightly(package, brought):
     new = {name.split(".")[0] for name in brought[package]}
     later = {"embreex", "manifold3d", "joblib", "distributed", "webdataset", "accelerate", "tensorboard"}
     assert new & (HEAVY | later) == set()
-
-
-@pytest.mark.parametrize("module", MODULES)
-def test_only_the_program_imports_the_command_line(module):
-    if part(module) not in ("cli", "commands", ""):
-        assert not any(
-            part(name) in ("cli", "commands") for name in imported(MODULES[module], module) if name.startswith("lsmgeo")
-        )
 
 
 def test_the_front_page_imports_the_core_alone():

@@ -3,9 +3,6 @@
 The folder is named by ``LSMGEO_TEST_DATA``; the sets themselves cannot be distributed.
 """
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -13,20 +10,11 @@ from benchmarks import classical
 from benchmarks.classical_rivals import bad_at, winners
 from lsmgeo import data
 from lsmgeo.classical import reconstruct_scene
-
-ROOT = os.environ.get("LSMGEO_TEST_DATA")
-pytestmark = pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of real photographs")
-
-
-def folder(name):
-    path = Path(ROOT) / name
-    if not path.is_dir():
-        pytest.skip(f"LSMGEO_TEST_DATA holds no {name}")
-    return path.parent
+from tests.data.real_sets import real_set
 
 
 def test_the_motorcycle_is_swept_better_than_by_the_plainest_sweep():
-    methods, true, agreed = classical.motorcycle(folder("middlebury_motorcycle"), planes=61, unfiltered=False)
+    methods, true, agreed = classical.motorcycle(real_set("middlebury_motorcycle").parent, planes=61, unfiltered=False)
     ours, plain, rival = (methods[name] for name in ("ours, filtered", "plain ZNCC", "StereoSGBM"))
     for density in classical.DENSITIES:
         assert bad_at(ours, true, density, 2.0) < bad_at(plain, true, density, 2.0)
@@ -38,14 +26,14 @@ def test_the_motorcycle_is_swept_better_than_by_the_plainest_sweep():
 
 @pytest.mark.long
 def test_depth_of_a_room_is_twice_as_good_as_the_plainest_sweeps():
-    found = classical.walk(folder("hololens_rgbd"), [21])
+    found = classical.walk(real_set("hololens_rgbd").parent, [21])
     assert found["ours"].shape == (1, 3)
     assert (found["ours"] <= 0.5 * found["plain ZNCC"]).all()
 
 
 @pytest.mark.parametrize("name", [pytest.param("fountain", marks=pytest.mark.long), "temple", "COLMAP scene"])
 def test_depth_agrees_with_triangulated_features(name):
-    scene = data.open(folder(classical.POSED[name]) / classical.POSED[name])
+    scene = data.open(real_set(classical.POSED[name]))
     swept = reconstruct_scene(scene, [1], size=256, planes=96, density=1.0, mesh=False, neighbours=3).views[0]
     assert float((swept.depth_map.depth > 0).float().mean()) >= 0.4
     if scene.points is not None:

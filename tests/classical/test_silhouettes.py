@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -15,9 +12,9 @@ from lsmgeo.cameras import orbit
 from lsmgeo.classical import hull_box, silhouettes, visual_hull
 from lsmgeo.data import Lens, PosedImages, open_scene
 from lsmgeo.errors import DataError, OptionError
+from tests.data.real_sets import real_set
 
 SIZE = (80, 100)
-DATA = os.environ.get("LSMGEO_TEST_DATA")
 
 
 def disc(view, radius=20.0):
@@ -159,9 +156,8 @@ def test_bad_input_is_refused(tmp_path):
         silhouettes(scene)
 
 
-@pytest.mark.skipif(DATA is None, reason="LSMGEO_TEST_DATA names no folder of sets")
 def test_the_temple_is_where_its_publisher_says():
-    scene = open_scene(Path(str(DATA)) / "middlebury_temple")
+    scene = open_scene(real_set("middlebury_temple"))
     masks = silhouettes(scene)
     grid = VoxelGrid((40, 72, 52), *hull_box(masks, scene.cameras))
     hull = visual_hull(masks, scene.cameras, grid, rule="all")

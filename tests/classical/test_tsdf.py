@@ -147,9 +147,7 @@ def test_half_a_pixel_would_be_seen():
 
 def test_views_are_weighted():
     """Two walls at depths 1.9 and 2.1 before one camera: in front of both, the mean by weight; between, one alone."""
-    camera = Cameras(
-        np.array([[[40.0, 0, 15.5], [0, 40, 15.5], [0, 0, 1]]]), np.eye(3)[None], np.zeros((1, 3)), (32, 32)
-    )
+    camera = straight_camera()
     twice = CameraTensors(*(torch.cat((value, value)) for value in camera.tensors()[:2]), 32, 32)
     depths = torch.stack((torch.full((32, 32), 1.9), torch.full((32, 32), 2.1))).double()
     grid = VoxelGrid((40, 1, 1), (-0.01, -0.01, 1.5), (0.01, 0.01, 2.5))
@@ -164,9 +162,7 @@ def test_views_are_weighted():
 
 def test_nothing_floats_between_the_two_sides_of_a_jump():
     """A near wall before a far one: it ends in a rim as deep as the truncation, and beyond that there is nothing."""
-    camera = Cameras(
-        np.array([[[40.0, 0, 15.5], [0, 40, 15.5], [0, 0, 1]]]), np.eye(3)[None], np.zeros((1, 3)), (32, 32)
-    )
+    camera = straight_camera()
     depth = np.full((1, 32, 32), 3.0)
     depth[:, :, 16:] = 2.0
     grid = VoxelGrid(40, (-0.7, -0.7, 1.8), (0.7, 0.7, 3.2))

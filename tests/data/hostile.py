@@ -2,7 +2,9 @@
 
 import io
 import os
+import struct
 import tarfile
+import zlib
 
 import numpy as np
 import pytest
@@ -14,6 +16,12 @@ from lsmgeo.errors import DataError
 TAR, SIDECAR = "set-000000.tar", "set-000000.json"
 # How many mutations of a file are tried: more in `make test-long`.
 TRIALS = 2000 if os.environ.get("HYPOTHESIS_PROFILE") == "long" else 100
+
+
+def chunk(kind, content, crc=None):
+    """Of a PNG."""
+    crc = zlib.crc32(kind + content) if crc is None else crc
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc)
 
 
 def read_all(folder):

@@ -6,11 +6,14 @@ The scene is that of `tests.data.writers`; where photographs should differ in si
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from PIL import Image
 
+from lsmgeo.data import PosedImages
 from tests.data.writers import Scene
 
 # Rows and columns taken off the bottom and the right, which leaves K as it is.
@@ -23,6 +26,17 @@ def trimmed(scene: Scene) -> list[np.ndarray]:
     return [
         image[: height - rows, : width - columns] for image, (rows, columns) in zip(scene.images, TRIMS, strict=False)
     ]
+
+
+def check_scene(read: PosedImages, scene: Scene, pictures: Sequence[np.ndarray]) -> None:
+    """Cameras and photographs are those that were written."""
+    np.testing.assert_allclose(read.cameras.intrinsics.numpy(), scene.K, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(read.cameras.cam_from_world[:, :3, :3].numpy(), scene.R, atol=1e-12)
+    np.testing.assert_allclose(read.cameras.cam_from_world[:, :3, 3].numpy(), scene.t, atol=1e-12)
+    for view, picture in enumerate(pictures):
+        assert read.size(view) == picture.shape[:2]
+        expected = torch.from_numpy(picture.copy()).permute(2, 0, 1).to(torch.float32) / 255
+        torch.testing.assert_close(read.load(view), expected, rtol=0, atol=0)
 
 
 def save(pictures: list[np.ndarray], names: list[str], folder: Path) -> None:

@@ -1,6 +1,5 @@
 """Binvox files: any grid comes back where the format's definition puts it, and files that lie are refused."""
 
-import os
 from pathlib import Path
 
 import hypothesis.extra.numpy as npst
@@ -14,10 +13,10 @@ from hypothesis import strategies as st
 from lsmgeo import data
 from lsmgeo.errors import DataError, OptionError
 from tests.data.hostile import TRIALS, judged, mutated
+from tests.data.real_sets import real_set
 from tests.data.release_writers import CENTRE, RADIUS, ball_voxels, binvox_bytes
 from tests.fuzz.forked import outcomes
 
-ROOT = os.environ.get("LSMGEO_TEST_DATA")
 HEADER = b"#binvox 1\ndim 2 2 2\ntranslate 0 0 0\nscale 1\ndata\n"
 GRIDS = st.integers(1, 9).flatmap(lambda side: npst.arrays(bool, (side,) * 3))
 
@@ -171,11 +170,8 @@ def test_damaged_files_are_refused_or_read(tmp_path):
     assert sorted(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of real voxels")
 def test_every_sample_of_a_real_surface_falls_in_an_occupied_voxel():
-    folder = Path(ROOT) / "binvox"
-    if not folder.is_dir():
-        pytest.skip("LSMGEO_TEST_DATA holds no binvox")
+    folder = real_set("binvox")
     (file,) = folder.glob("*.binvox")
     mesh = trimesh.load(file.with_suffix(".obj"), force="mesh")
     samples, _ = trimesh.sample.sample_surface(mesh, 50_000, seed=0)

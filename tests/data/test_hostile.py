@@ -11,7 +11,7 @@ from PIL.PngImagePlugin import PngImageFile
 
 from lsmgeo import data
 from lsmgeo.errors import DataError
-from tests.data.hostile import judge_mutations, read_scene, scene_refused
+from tests.data.hostile import chunk, judge_mutations, read_scene, scene_refused
 from tests.data.writers import make_scene, write_colmap, write_middlebury
 
 SCENE = make_scene(24, 32)
@@ -145,10 +145,6 @@ def test_a_pipe_is_not_waited_for(tmp_path):
 
 def png_of(width, height, *, payload=b""):
     """A PNG header of any size, with hardly any data."""
-
-    def chunk(kind, content):
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(payload)) + chunk(b"IEND", b"")
 

@@ -245,7 +245,8 @@ print(done, refused, int(peak.split()[1]) // 1024)
 """
 
 
-def mutate(tmp_path, seed, trials):
+@pytest.mark.parametrize(("seed", "trials"), [(0, 100), pytest.param(1, 5000, marks=pytest.mark.long)])
+def test_mutated_files_in_little_memory(tmp_path, seed, trials):
     for name, content in writers.samples().items():
         (tmp_path / name).write_bytes(content)
     parsers = Path(mesh_parsing.__file__).parent
@@ -257,12 +258,3 @@ def mutate(tmp_path, seed, trials):
     assert done == trials * len(writers.samples())
     assert refusals > done // 4
     assert megabytes <= 512
-
-
-def test_mutated_files_in_little_memory(tmp_path):
-    mutate(tmp_path, 0, 100)
-
-
-@pytest.mark.long
-def test_many_mutated_files_in_little_memory(tmp_path):
-    mutate(tmp_path, 1, 5000)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lsmgeo.data.images import DEPTH, RGBA, decode_png, encode_png
-from tests.data.hostile import TAR, TRIALS, judged, mutated, read_all, refused, rewritten
+from tests.data.hostile import TAR, TRIALS, chunk, judged, mutated, read_all, refused, rewritten
 from tests.data.shapes import write_set
 from tests.fuzz import forked
 
@@ -18,11 +18,6 @@ pytestmark = pytest.mark.timeout(120)
 def folder(tmp_path):
     write_set(tmp_path, shards=1, each=2, views=2)
     return tmp_path
-
-
-def chunk(kind, content, crc=None):
-    crc = zlib.crc32(kind + content) if crc is None else crc
-    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc)
 
 
 def png(width=16, height=12, bits=8, colour=6, interlace=0, data=None, before=b""):

@@ -8,14 +8,8 @@ from PIL import Image
 from lsmgeo import data
 from lsmgeo.errors import DataError
 from tests.data.posed_writers import llff_rows, save
-from tests.data.writers import make_scene
 
 FOCAL = 157.25
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return make_scene(48, 64)
 
 
 def write(scene, folder, pictures="images", rows=None):

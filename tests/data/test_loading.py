@@ -207,11 +207,6 @@ def test_shapes_are_chosen_by_category_and_split(folder):
         dataset_of(folder, categories=[])
 
 
-def test_no_tar_is_read_to_choose(folder, monkeypatch):
-    monkeypatch.setattr(ShardSet, "_fetch", lambda *_: pytest.fail("a member is read"))
-    assert len(dataset_of(folder, split="train", categories="chair")) == 3
-
-
 @pytest.mark.parametrize(
     ("options", "error", "match"),
     [

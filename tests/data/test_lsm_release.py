@@ -8,7 +8,7 @@ import zlib
 import numpy as np
 import pytest
 import torch
-from scipy.io import loadmat, savemat
+from scipy.io import savemat
 
 from lsmgeo import data
 from lsmgeo.data import lsm_release
@@ -267,12 +267,3 @@ def test_the_answer_of_a_process_is_checked(tmp_path, monkeypatch, array):
     (found,) = read_mats([tmp_path / "camera.mat"])
     assert isinstance(found, DataError)
     assert found.path == tmp_path / "camera.mat"
-
-
-def test_the_bomb_is_one():
-    content = bomb()
-    assert len(content) < 1 << 21
-    unpacked = zlib.decompressobj().decompress(content[136:], 1 << 25)
-    assert len(unpacked) == 1 << 25
-    assert b"Volume" in unpacked[:100]
-    np.testing.assert_array_equal(loadmat(io.BytesIO(mat(camera())))["extrinsic"], lsm_pose(0))

@@ -11,7 +11,7 @@ from lsmgeo import cameras, scenes
 from lsmgeo.data import Mesh, from_trimesh, load_mesh, normalise, render_mesh
 from lsmgeo.data.mesh_rendering import EmbreeCaster, NumpyCaster
 from lsmgeo.errors import BackendError, CameraError, DTypeError, OptionError, ShapeError
-from tests.data.real_meshes import folder_of_meshes, needs_meshes
+from tests.data.real_sets import folder_of_meshes
 from tests.tolerances import TERMWISE, length_error
 
 pytest.importorskip("embreex")
@@ -354,7 +354,6 @@ def test_options_are_checked():
         render_mesh(mesh, many._replace(cam_from_world=2 * many.cam_from_world), light)
 
 
-@needs_meshes
 @pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.long)])
 def test_154_meshes_are_rendered(every):
     many = views(2, 64)

@@ -12,7 +12,7 @@ from lsmgeo.data import Mesh, from_trimesh, load_mesh, normalise
 from lsmgeo.data.mesh_topology import corner_normals
 from lsmgeo.errors import DataError, DTypeError, OptionError, ShapeError
 from tests.data import mesh_writers as writers
-from tests.data.real_meshes import folder_of_meshes, needs_meshes
+from tests.data.real_sets import folder_of_meshes
 from tests.tolerances import TERMWISE
 
 
@@ -185,7 +185,6 @@ def test_normals_are_smooth_on_a_sphere_and_sharp_on_a_box():
     np.testing.assert_allclose(normals[~side], np.repeat(can.face_normals[~side][:, None], 3, 1), atol=1e-12)
 
 
-@needs_meshes
 def test_154_meshes_are_read_as_trimesh_reads_them():
     folder = folder_of_meshes()
     rows = list(csv.DictReader((folder / "index.csv").read_text().splitlines()))

@@ -4,12 +4,11 @@ import json
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from lsmgeo import data
 from lsmgeo.errors import DataError
-from tests.data.posed_writers import strecha_text, trimmed, write_plain_cameras, write_strecha
+from tests.data.posed_writers import check_scene, strecha_text, trimmed, write_plain_cameras, write_strecha
 from tests.data.writers import make_scene
 
 
@@ -17,16 +16,6 @@ from tests.data.writers import make_scene
 def scene():
     scene = make_scene(48, 64)
     return scene._replace(K=scene.K + np.array([[0, 1.5, 0], [0, 0, 0], [0, 0, 0]]))  # these formats have skew
-
-
-def check(read, scene):
-    np.testing.assert_allclose(read.cameras.intrinsics.numpy(), scene.K, rtol=1e-13)
-    np.testing.assert_allclose(read.cameras.cam_from_world[:, :3, :3].numpy(), scene.R, atol=1e-12)
-    np.testing.assert_allclose(read.cameras.cam_from_world[:, :3, 3].numpy(), scene.t, atol=1e-12)
-    for view, picture in enumerate(trimmed(scene)):
-        assert read.size(view) == picture.shape[:2]
-        expected = torch.from_numpy(picture.copy()).permute(2, 0, 1).to(torch.float32) / 255
-        torch.testing.assert_close(read.load(view), expected, rtol=0, atol=0)
 
 
 def as_half(values):
@@ -49,9 +38,9 @@ def test_plain_cameras_read_back(scene, tmp_path, change):
     read = data.open(write_plain_cameras(scene, tmp_path, change))
     assert read.source == "cameras"
     assert read.names == tuple(f"images/{name}" for name in scene.names)
-    check(read, scene)
+    check_scene(read, scene, trimmed(scene))
     (tmp_path / "cameras.json").rename(tmp_path / "another name.json")
-    check(data.open(tmp_path / "another name.json"), scene)
+    check_scene(data.open(tmp_path / "another name.json"), scene, trimmed(scene))
 
 
 def entry(**changes):
@@ -97,7 +86,7 @@ def test_strecha_scenes_read_back(scene, tmp_path, cameras, images):
         read = data.open(path)
         assert read.source == "strecha"
         assert read.names == tuple(names)
-        check(read, scene)
+        check_scene(read, scene, trimmed(scene))
 
 
 def rewritten(scene, line, text):

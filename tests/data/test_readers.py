@@ -8,6 +8,7 @@ from PIL import Image
 from lsmgeo import data
 from lsmgeo.data.images import image_size
 from lsmgeo.errors import DataError
+from tests.data.posed_writers import check_scene
 from tests.data.writers import make_scene, project, write_colmap, write_middlebury
 
 
@@ -16,27 +17,12 @@ def scene():
     return make_scene()
 
 
-def check_cameras(read, scene):
-    np.testing.assert_allclose(read.cameras.intrinsics.numpy(), scene.K, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(read.cameras.cam_from_world[:, :3, :3].numpy(), scene.R, atol=1e-12)
-    np.testing.assert_allclose(read.cameras.cam_from_world[:, :3, 3].numpy(), scene.t, atol=1e-12)
-    assert read.cameras.height.tolist() == [72] * 5
-    assert read.cameras.width.tolist() == [96] * 5
-
-
-def check_images(read, scene):
-    for view, image in enumerate(scene.images):
-        expected = torch.from_numpy(image).permute(2, 0, 1).to(torch.float32) / 255
-        torch.testing.assert_close(read.load(view), expected, rtol=0, atol=0)
-
-
 def test_a_middlebury_folder_reads_back(scene, tmp_path):
     read = data.open(write_middlebury(scene, tmp_path))
     assert read.source == "middlebury"
     assert read.names == ("v0.png", "v1.png", "v2.png", "v4.png", "view_3.png")
     assert read.points is None
-    check_cameras(read, scene)
-    check_images(read, scene)
+    check_scene(read, scene, scene.images)
     assert data.open(tmp_path / "scene_par.txt").names == read.names
 
 
@@ -46,8 +32,7 @@ def test_a_colmap_model_reads_back(scene, tmp_path, form, sparse):
     read = data.open(write_colmap(scene, tmp_path, form=form, sparse=sparse))
     assert read.source == "colmap"
     assert read.names == tuple(scene.names)
-    check_cameras(read, scene)
-    check_images(read, scene)
+    check_scene(read, scene, scene.images)
     np.testing.assert_allclose(read.points.positions, scene.points, rtol=0, atol=0)
     np.testing.assert_array_equal(read.points.colours, scene.colours)
     for view, observed in enumerate(read.points.observations):

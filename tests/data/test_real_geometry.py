@@ -3,9 +3,6 @@
 The folder is named by ``LSMGEO_TEST_DATA``; the sets themselves cannot be distributed.
 """
 
-import os
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -16,17 +13,8 @@ from lsmgeo import cli, data
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.classical import reconstruct_view
 from lsmgeo.functional import sample_views
+from tests.data.real_sets import real_set
 from tests.data.test_stereo_pairs import write_pair
-
-ROOT = os.environ.get("LSMGEO_TEST_DATA")
-pytestmark = pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of real photographs")
-
-
-def folder(name):
-    path = Path(ROOT) / name
-    if not path.is_dir():
-        pytest.skip(f"LSMGEO_TEST_DATA holds no {name}")
-    return path
 
 
 def fundamental(cameras: CameraTensors, first: int, second: int) -> np.ndarray:
@@ -60,7 +48,7 @@ def epipolar_errors(cameras, images, pairs, *, sampson=False):
 
 
 def test_temple_epipolar_error():
-    scene = data.open(folder("middlebury_temple"))
+    scene = data.open(real_set("middlebury_temple"))
     images = [data.read_image(path) for path in scene.paths]
     assert len(scene) == 16
     errors = epipolar_errors(scene.cameras, images, [(0, 1), (2, 3), (3, 4), (5, 6), (6, 7), (7, 8), (8, 9), (11, 12)])
@@ -69,7 +57,7 @@ def test_temple_epipolar_error():
 
 
 def test_fountain_epipolar_error():
-    scene = data.open(folder("strecha_fountain_quarter"))
+    scene = data.open(real_set("strecha_fountain_quarter"))
     images = [data.read_image(path) for path in scene.paths]
     errors = epipolar_errors(scene.cameras, images, [(index, index + 1) for index in range(0, 10, 2)])
     assert len(errors) > 500
@@ -77,7 +65,7 @@ def test_fountain_epipolar_error():
 
 
 def test_nerf_epipolar_error():
-    scene = data.open(folder("nerf_lego"))
+    scene = data.open(real_set("nerf_lego"))
     # On white: cut out against the black of transparent pixels, the edges would move.
     images = [(255 * scene.load(view)).round().byte().permute(1, 2, 0).numpy() for view in range(len(scene))]
     # The two frames 7 degrees apart; all others are too far from each other to match.
@@ -88,7 +76,7 @@ def test_nerf_epipolar_error():
 
 
 def test_colmap_reprojection_error():
-    scene = data.open(folder("colmap_scene"))
+    scene = data.open(real_set("colmap_scene"))
     assert len(scene) == 23
     assert len(scene.points.positions) == 1443
     errors = []
@@ -109,7 +97,7 @@ def test_colmap_reprojection_error():
     [("00005.png", "00010.png"), ("00010.png", "00015.png"), ("00055.png", "00060.png"), ("00090.png", "00095.png")],
 )
 def test_hololens_depth_of_one_frame_is_that_of_another(first, second):
-    scene = data.open(folder("hololens_rgbd"))
+    scene = data.open(real_set("hololens_rgbd"))
     assert len(scene) == 29
     views = [scene.names.index(name) for name in (first, second)]
     cameras = CameraTensors(*(torch.as_tensor(value)[views] for value in scene.cameras))
@@ -136,7 +124,7 @@ def test_hololens_depth_of_one_frame_is_that_of_another(first, second):
 
 
 def test_the_motorcycle_s_right_photograph_becomes_the_left_one(tmp_path):
-    path = folder("middlebury_motorcycle")
+    path = real_set("middlebury_motorcycle")
     pictures = [np.asarray(Image.open(path / f"motorcycle_{side}.png").convert("RGB")) for side in ("left", "right")]
     disparity = np.load(path / "motorcycle_disp.npz")["arr_0"].astype(np.float32)
     numbers = (994.978, 311.193, 254.877, 31.086, 193.001)
@@ -158,14 +146,14 @@ def test_the_motorcycle_s_right_photograph_becomes_the_left_one(tmp_path):
 
 
 def test_colmap_depth_error_at_its_own_points():
-    scene = data.open(folder("colmap_scene"))
+    scene = data.open(real_set("colmap_scene"))
     result = reconstruct_view(scene, 5, size=250)
     assert result.error.points > 200
     assert result.error.median < 0.005
 
 
 def test_the_temple_lies_inside_its_published_box(tmp_path, capsys):
-    path = folder("middlebury_temple")
+    path = real_set("middlebury_temple")
     arguments = ["reconstruct", str(path), "--view", "6", "--size", "200", "--out", str(tmp_path)]
     assert cli.main(arguments) == 0
     import trimesh

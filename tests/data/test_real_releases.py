@@ -3,25 +3,12 @@
 The folder is named by ``LSMGEO_TEST_DATA``; the sets themselves cannot be distributed.
 """
 
-import os
-from pathlib import Path
-
 import numpy as np
-import pytest
 from PIL import Image
 from scipy.ndimage import binary_dilation
 
 from lsmgeo import data
-
-ROOT = os.environ.get("LSMGEO_TEST_DATA")
-pytestmark = pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of real renderings")
-
-
-def folders(pattern):
-    found = sorted(Path(ROOT).glob(pattern))
-    if not found:
-        pytest.skip(f"LSMGEO_TEST_DATA holds no {pattern}")
-    return found
+from tests.data.real_sets import real_sets
 
 
 def cell_pixels(scene, view, share):
@@ -38,7 +25,7 @@ def cell_pixels(scene, view, share):
 
 def test_depth_of_the_lsm_sample_lies_at_its_voxels():
     near = total = 0
-    for folder in folders("lsm_sample/renders/*/*"):
+    for folder in real_sets("lsm_sample/renders/*/*"):
         scene = data.open(folder)
         assert len(scene) == 20
         occupied = binary_dilation(scene.voxels.occupancy.numpy(), np.ones((3, 3, 3)))
@@ -58,7 +45,7 @@ def test_depth_of_the_lsm_sample_lies_at_its_voxels():
 
 
 def test_every_voxel_of_the_lsm_sample_meets_every_silhouette():
-    for folder in folders("lsm_sample/renders/*/*"):
+    for folder in real_sets("lsm_sample/renders/*/*"):
         scene = data.open(folder)
         for view in range(len(scene)):
             alpha = np.array(Image.open(scene.paths[view]))[..., 3] > 0
@@ -67,14 +54,14 @@ def test_every_voxel_of_the_lsm_sample_meets_every_silhouette():
 
 
 def test_the_other_resolution_of_the_lsm_sample_is_the_same_solid():
-    for folder in folders("lsm_sample/renders/*/*"):
+    for folder in real_sets("lsm_sample/renders/*/*"):
         coarse, fine = (data.read_lsm(folder, voxels=side).voxels.occupancy.numpy() for side in (32, 64))
         halved = fine.reshape(32, 2, 32, 2, 32, 2).any((1, 3, 5))
         assert (halved & coarse).sum() / (halved | coarse).sum() > 0.8
 
 
 def test_the_voxels_of_the_r2n2_chair_fill_its_silhouettes():
-    (folder,) = folders("r2n2/chair")
+    (folder,) = real_sets("r2n2/chair")
     scene = data.open(folder)
     assert len(scene) == 24
     assert scene.size(0) == (137, 137)

@@ -11,14 +11,9 @@ from PIL import Image
 from lsmgeo import data
 from lsmgeo.errors import DataError, OptionError
 from tests.data.posed_writers import trimmed, write_plain_cameras, write_transforms
-from tests.data.writers import make_scene, project, write_colmap
+from tests.data.writers import project, write_colmap
 
 WRITERS = {"colmap": data.write_colmap, "transforms": data.write_transforms, "cameras": data.write_cameras_json}
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return make_scene(48, 64)
 
 
 def check(read, source, atol=1e-12):

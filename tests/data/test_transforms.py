@@ -10,23 +10,15 @@ from PIL import Image
 
 from lsmgeo import data
 from lsmgeo.errors import DataError
-from tests.data.posed_writers import photograph_sky, see_fisheye, see_perspective, sky, trimmed, write_transforms
-from tests.data.writers import make_scene
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return make_scene(48, 64)
-
-
-def check(read, scene, pictures):
-    np.testing.assert_allclose(read.cameras.intrinsics.numpy(), scene.K, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(read.cameras.cam_from_world[:, :3, :3].numpy(), scene.R, atol=1e-12)
-    np.testing.assert_allclose(read.cameras.cam_from_world[:, :3, 3].numpy(), scene.t, atol=1e-12)
-    for view, picture in enumerate(pictures):
-        assert read.size(view) == picture.shape[:2]
-        expected = torch.from_numpy(picture.copy()).permute(2, 0, 1).to(torch.float32) / 255
-        torch.testing.assert_close(read.load(view), expected, rtol=0, atol=0)
+from tests.data.posed_writers import (
+    check_scene,
+    photograph_sky,
+    see_fisheye,
+    see_perspective,
+    sky,
+    trimmed,
+    write_transforms,
+)
 
 
 def test_frames_of_different_sizes_read_back(scene, tmp_path):
@@ -36,7 +28,7 @@ def test_frames_of_different_sizes_read_back(scene, tmp_path):
     assert read.points is None
     assert read.lenses is None
     assert not read.cut_out
-    check(read, scene, trimmed(scene))
+    check_scene(read, scene, trimmed(scene))
     assert data.open(tmp_path / "transforms.json").names == read.names
 
 
@@ -47,7 +39,7 @@ def test_what_is_stated_once_holds_for_all_and_a_frame_overrides_it(scene, tmp_p
         for frame in frames:
             del frame["w"], frame["h"]
 
-    check(data.open(write_transforms(scene, tmp_path, change)), scene, trimmed(scene))
+    check_scene(data.open(write_transforms(scene, tmp_path, change)), scene, trimmed(scene))
 
 
 def test_an_angle_states_the_focal_length_and_the_middle_is_the_pictures(scene, tmp_path):
@@ -78,7 +70,7 @@ def test_three_rows_and_names_without_their_ending(scene, tmp_path):
 
     read = data.open(write_transforms(scene, tmp_path, change))
     assert read.names[0] == "./images/v0"
-    check(read, scene, trimmed(scene))
+    check_scene(read, scene, trimmed(scene))
 
 
 def test_alpha_cuts_out(scene, tmp_path):

@@ -17,7 +17,7 @@ from lsmgeo.data.voxelise import _by_vote as by_vote
 from lsmgeo.data.voxelise import plan_voxels, winding_number
 from lsmgeo.errors import BackendError, DTypeError, GridError, OptionError
 from lsmgeo.scenes.meshing import to_mesh
-from tests.data.real_meshes import folder_of_meshes, needs_meshes
+from tests.data.real_sets import folder_of_meshes
 
 
 def centres(count, lower=-0.5, upper=0.5):
@@ -226,14 +226,6 @@ def test_surface_voxels_hold_every_point_of_the_surface():
     assert np.abs(np.hypot(np.hypot(x, y) - 0.3, z) - 0.12).max() < np.sqrt(3) / 64  # half a voxel's diagonal
 
 
-def test_touched_voxels_know_the_axes_of_their_normals():
-    square = np.array([[[-0.5, 3.2, -0.5], [7.5, 3.2, -0.5], [7.5, 3.2, 7.5]]])
-    touched = cells_touched(square, (8, 8, 8))
-    assert set(np.unique(touched)) == {0, 2}
-    assert touched[:, 3].any()
-    assert not np.delete(touched, 3, axis=1).any()
-
-
 def test_solids_of_scenes_and_their_meshes_agree():
     parts = [
         scenes.box((-0.1, 0.05, 0.0), (0.2, 0.1, 0.3)),
@@ -308,7 +300,6 @@ def test_options_are_checked():
     assert not voxelise(mesh, lower=5.0, upper=6.0).any()  # all of it elsewhere
 
 
-@needs_meshes
 def test_154_meshes_have_voxels():
     for path in sorted(folder_of_meshes().glob("*.ply")):
         mesh = normalise(load_mesh(path))

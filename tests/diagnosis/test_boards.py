@@ -1,6 +1,5 @@
 """Calibrations of rendered chessboards: the truth passes, and each planted mistake fails and is named."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,8 +13,8 @@ from lsmgeo.data import Board, CalibratedLens, Calibration, Rig
 from lsmgeo.diagnosis.board_fitting import board_points, find_corners
 from lsmgeo.diagnosis.boards import examine_calibration
 from lsmgeo.diagnosis.findings import report
+from tests.data.real_sets import real_set
 
-ROOT = os.environ.get("LSMGEO_TEST_DATA")
 HERE = Path("rig.yml")
 SIZE = (240, 320)
 SQUARE = 0.03
@@ -225,11 +224,8 @@ def test_what_cannot_be_measured_is_unknown(truth, tmp_path):
     assert set(values(findings)) == {"rms under the lens first", "rms under the lens second"}
 
 
-@pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of real photographs")
 def test_opencv_s_chessboards_reach_their_figure():
-    folder = Path(ROOT) / "opencv_stereo"
-    if not folder.is_dir():
-        pytest.skip("LSMGEO_TEST_DATA holds no opencv_stereo")
+    folder = real_set("opencv_stereo")
     pictures = data.read_calibration(folder / "stereo_calib.xml")
     findings = examine_calibration(pictures, folder)
     assert findings.verdict == "good"

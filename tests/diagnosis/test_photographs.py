@@ -83,7 +83,6 @@ def test_right_cameras_are_good(photographs):
 def test_a_mistake_is_told_from_features_alone(photographs, mistake):
     findings = examine_photographs(planted(photographs, mistake)).findings
     assert findings.verdict == "bad"
-    assert findings.cause is not None
     assert findings.cause.name == mistake
 
 
@@ -93,7 +92,6 @@ def test_half_a_pixel_is_found_though_all_checks_pass(photographs, shift):
     K[:, :2, 2] += shift
     findings = examine_photographs(with_cameras(photographs, K=K)).findings
     assert all(check.passed for check in findings.checks)
-    assert findings.cause is not None
     assert findings.cause.name == "half a pixel"
     assert ("subtract 0.5" if shift > 0 else "add 0.5") in findings.cause.remedy
 
@@ -180,8 +178,7 @@ def test_moving_and_scaling_the_world_changes_nothing(room, photographs):
     [
         *COMMON,
         "half a pixel",
-        pytest.param("rotation transposed", marks=LONG),
-        pytest.param("centre taken as translation", marks=LONG),
+        *(pytest.param(name, marks=LONG) for name in ("rotation transposed", "centre taken as translation")),
     ],
 )
 def test_a_mistake_is_told_from_points_alone(room, blank, mistake):
@@ -193,7 +190,6 @@ def test_a_mistake_is_told_from_points_alone(room, blank, mistake):
         K, E = matrices(scene)
         wrong = with_cameras(scene, K=K[order], E=E[order])
     cause = examine_photographs(wrong).findings.cause
-    assert cause is not None
     assert cause.name == mistake
 
 
@@ -203,22 +199,13 @@ def test_reprojection_error_is_that_of_the_noise(room, blank):
     np.testing.assert_allclose(check(findings, "reprojection").value, 0.3 * np.sqrt(2 * np.log(2)), rtol=0.1)
 
 
-@pytest.mark.parametrize(
-    "mistake",
-    [
-        "poses inverted",
-        pytest.param("OpenGL axes", marks=LONG),
-        pytest.param("y flipped", marks=LONG),
-        pytest.param("K of another resolution", marks=LONG),
-    ],
-)
+@pytest.mark.parametrize("mistake", [COMMON[0], *(pytest.param(name, marks=LONG) for name in COMMON[1:4])])
 def test_a_mistake_is_told_from_depth_alone(room, blank, mistake):
     scene = with_depth(blank, room)
     good = examine_photographs(scene).findings
     assert good.verdict == "good"
     assert check(good, "depth of one view").value < 0.5
     cause = examine_photographs(planted(scene, mistake)).findings.cause
-    assert cause is not None
     assert cause.name == mistake
 
 
@@ -229,7 +216,6 @@ def test_depth_in_millimetres_and_along_the_ray_are_named(room, blank):
     v, u = np.mgrid[:240, :320]
     rays = np.stack([u, v, np.ones_like(u)], -1)[None] @ np.linalg.inv(room.K)[:, None].transpose(0, 1, 3, 2)
     findings = examine_photographs(with_depth(blank, room, room.depth * np.linalg.norm(rays, axis=-1))).findings
-    assert findings.cause is not None
     assert findings.cause.name == "depth along the ray"
 
 
@@ -243,7 +229,6 @@ def test_a_mistake_is_told_from_outlines_alone(cut_out, solid, mistake):
         assert check(good, "inside the outlines").value > 99
         assert check(good, "overlap").value > 80
     cause = examine_photographs(planted(scene, mistake)).findings.cause
-    assert cause is not None
     assert cause.name == mistake
 
 

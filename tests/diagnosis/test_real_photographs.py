@@ -1,17 +1,12 @@
 """Mistakes planted in real photographs of measured geometry are named, and the sets as they are are not accused."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from lsmgeo import data
 from lsmgeo.diagnosis.photographs import examine_photographs
+from tests.data.real_sets import real_set
 from tests.diagnosis.textured import planted
-
-ROOT = os.environ.get("LSMGEO_TEST_DATA")
-pytestmark = pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of real photographs")
 
 SETS = {
     "middlebury_temple": ("epipolar", 0.16),
@@ -20,27 +15,20 @@ SETS = {
 }
 
 
-def scene(name):
-    path = Path(ROOT) / name
-    if not path.is_dir():
-        pytest.skip(f"LSMGEO_TEST_DATA holds no {name}")
-    return data.open(path)
-
-
 MISTAKES = ["poses inverted", "OpenGL axes", "y flipped", "half a pixel", "K of another resolution", "frames shuffled"]
 # Of sets that take longer, these are planted every time and the others in the long run.
 QUICK = {"strecha_fountain_quarter": ("half a pixel", "frames shuffled"), "colmap_scene": ("half a pixel",)}
 
 
 def named(name, mistake):
-    cause = examine_photographs(planted(scene(name), mistake)).findings.cause
+    cause = examine_photographs(planted(data.open(real_set(name)), mistake)).findings.cause
     return None if cause is None else cause.name
 
 
 @pytest.mark.parametrize("name", SETS)  # in one test, so that one worker matches a set and no other does
 def test_the_measured_figure_is_reached_and_planted_mistakes_are_named(name):
     kind, expected = SETS[name]
-    findings = examine_photographs(scene(name)).findings
+    findings = examine_photographs(data.open(real_set(name))).findings
     assert findings.verdict == "good"
     check = next(check for check in findings.checks if kind in check.name)
     assert check.measured > 1000

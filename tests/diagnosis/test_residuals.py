@@ -10,7 +10,7 @@ from lsmgeo.data.posed import Observations, SparsePoints, Voxels
 from lsmgeo.diagnosis.findings import Check, badness
 from lsmgeo.diagnosis.geometry import Geometry, Hypothesis
 from lsmgeo.diagnosis.half_pixel import find_shifts
-from lsmgeo.diagnosis.matching import Matches, choose_views
+from lsmgeo.diagnosis.matching import Matches
 from lsmgeo.diagnosis.orders import assigned, named_orders, search_order
 from lsmgeo.diagnosis.residuals import (
     in_front,
@@ -204,15 +204,6 @@ def test_orders_that_have_names():
     assert orders["every photograph at the camera 1 place later"] == [1, 2, 0]
     assert orders["every photograph at the camera 1 place earlier"] == [2, 0, 1]
     assert len(named_orders(["9" * 5000, "1" * 5000])) == 2
-
-
-def test_views_are_chosen_in_runs():
-    np.testing.assert_array_equal(choose_views(40), np.arange(40))
-    chosen = choose_views(1000)
-    assert len(chosen) == 40
-    assert chosen[0] == 0
-    assert chosen[-1] == 999
-    np.testing.assert_array_equal(np.diff(chosen.reshape(10, 4), axis=1), 1)
 
 
 def test_badness_is_a_multiple_of_the_limit():

@@ -1,8 +1,6 @@
 """Voxels against the mesh beside them: right ones pass, and every mistake is found and named."""
 
-import os
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +9,9 @@ import trimesh
 
 from lsmgeo import VoxelGrid, data
 from lsmgeo.diagnosis.solids import examine_voxels
+from tests.data.real_sets import real_set
 from tests.data.release_writers import binvox_bytes
 
-ROOT = os.environ.get("LSMGEO_TEST_DATA")
 # No symmetry, off the grid's middle.
 CORNERS = np.array([[0.1, 0.2, 0.1], [0.9, 0.3, 0.2], [0.35, 1.3, 0.15], [0.3, 0.35, 0.7]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
@@ -146,11 +144,8 @@ def test_other_voxels_than_binvox(folder):
     assert dict(examine_voxels(half, folder).facts)["voxels"] == "24 x 24 x 18 (x, y, z)"
 
 
-@pytest.mark.skipif(not ROOT, reason="LSMGEO_TEST_DATA names no folder of real voxels")
 def test_real_voxels_in_both_placements():
-    folder = Path(ROOT) / "binvox"
-    if not folder.is_dir():
-        pytest.skip("LSMGEO_TEST_DATA holds no binvox")
+    folder = real_set("binvox")
     good = examine_voxels(data.read_binvox(folder), folder)
     assert good.verdict == "good"
     assert good.checks[0].value == 100.0

@@ -173,49 +173,40 @@ def in_order(scene, order):
     return moved if scene.depths is None else replace(moved, depths=tuple(scene.depths[index] for index in order))
 
 
-def planted(scene, mistake):
-    K, E = matrices(scene)
-    gl = np.diag([1.0, -1.0, -1.0, 1.0])
-    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
-    if mistake == "poses inverted":
-        return with_cameras(scene, E=np.linalg.inv(E))
-    if mistake == "OpenGL axes":
-        return with_cameras(scene, E=gl @ E)
-    if mistake == "poses inverted and OpenGL axes":
+def mistaken(K, E, mistake):
+    """K (V, 3, 3) and E (V, 4, 4) as a mistake leaves them, without the library's converters."""
+    gl, mirror = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([1.0, -1.0, 1.0, 1.0])
+    half = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])  # (c + 1/2) / 2 - 1/2
+    transposed, centred, negated = E.copy(), E.copy(), E.copy()
+    transposed[:, :3, :3] = E[:, :3, :3].transpose(0, 2, 1)
+    centred[:, :3, 3] = np.linalg.inv(E)[:, :3, 3]
+    negated[:, :3, 3] *= -1
+    changed = {
+        "poses inverted": (K, np.linalg.inv(E)),
+        "OpenGL axes": (K, gl @ E),
         # NeRF's camera-to-world, read as world-to-camera.
-        return with_cameras(scene, E=np.linalg.inv(gl @ E))
-    if mistake == "y flipped":
-        return with_cameras(scene, E=mirror @ E @ mirror)
-    if mistake == "rotation transposed":
-        E[:, :3, :3] = E[:, :3, :3].transpose(0, 2, 1).copy()
-        return with_cameras(scene, E=E)
-    if mistake == "centre taken as translation":
-        E[:, :3, 3] = np.linalg.inv(E)[:, :3, 3]
-        return with_cameras(scene, E=E)
-    if mistake == "translation negated":
-        E[:, :3, 3] *= -1
-        return with_cameras(scene, E=E)
-    if mistake == "other camera axes":
+        "poses inverted and OpenGL axes": (K, np.linalg.inv(gl @ E)),
+        "y flipped": (K, mirror @ E @ mirror),
+        "rotation transposed": (K, transposed),
+        "centre taken as translation": (K, centred),
+        "translation negated": (K, negated),
         # LLFF's: down, right, back.
-        turn = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-        return with_cameras(scene, E=turn @ E)
-    if mistake == "focal length off":
-        K[:, 0, 0] *= 1.4
-        K[:, 1, 1] *= 1.4
-        return with_cameras(scene, K=K)
-    if mistake == "K of another resolution":
-        K[:, :2] *= 0.5
-        K[:, :2, 2] -= 0.25
-        return with_cameras(scene, K=K)
-    if mistake == "half a pixel":
-        K[:, :2, 2] += 0.5
-        return with_cameras(scene, K=K)
-    if mistake == "frames shuffled":
-        # A photograph of another size is refused before anything is measured.
-        sizes = np.array([scene.size(view) for view in range(len(scene))])
-        order, rng = np.arange(len(scene)), np.random.default_rng(3)
-        for size in np.unique(sizes, axis=0):
-            alike = np.flatnonzero((sizes == size).all(1))
-            order[alike] = rng.permutation(alike)
-        return in_order(scene, order)
-    raise ValueError(mistake)
+        "other camera axes": (K, np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]) @ E),
+        "focal length off": (K * [[1.4, 1, 1], [1, 1.4, 1], [1, 1, 1]], E),
+        "K of another resolution": (half @ K, E),
+        "half a pixel": (K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), E),
+    }
+    return changed[mistake]
+
+
+def planted(scene, mistake):
+    if mistake != "frames shuffled":
+        K, E = mistaken(*matrices(scene), mistake)
+        return with_cameras(scene, K=K, E=E)
+    # A photograph of another size is refused before anything is measured.
+    sizes = np.array([scene.size(view) for view in range(len(scene))])
+    order, rng = np.arange(len(scene)), np.random.default_rng(3)
+    for size in np.unique(sizes, axis=0):
+        alike = np.flatnonzero((sizes == size).all(1))
+        order[alike] = rng.permutation(alike)
+    return in_order(scene, order)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from lsmgeo import cameras
+from tests.diagnosis.textured import mistaken
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "troubleshooting.rst"
 HEIGHT, WIDTH = 48, 64
@@ -33,51 +34,18 @@ def right_cameras() -> cameras.CameraTensors:
     return views._replace(intrinsics=views.intrinsics + shift)
 
 
-def moved(views: cameras.CameraTensors, change: torch.Tensor) -> cameras.CameraTensors:
-    return views._replace(intrinsics=views.intrinsics + change.to(views.intrinsics))
-
-
-def posed(views: cameras.CameraTensors, R: torch.Tensor, t: torch.Tensor) -> cameras.CameraTensors:
-    E = views.cam_from_world.clone()
-    E[:, :3, :3], E[:, :3, 3] = R, t
-    return views._replace(cam_from_world=E)
-
-
 def planted(name: str, views: cameras.CameraTensors) -> cameras.CameraTensors:
-    """The mistake, written without the library's converters."""
-    E, K = views.cam_from_world, views.intrinsics
-    R, t = E[:, :3, :3], E[:, :3, 3]
-    if name == "poses inverted":
-        return posed(views, R.mT, -torch.einsum("vji,vj->vi", R, t))
-    if name == "OpenGL axes":
-        sign = torch.tensor([1.0, -1.0, -1.0], dtype=E.dtype)
-        return posed(views, sign[:, None] * R, sign * t)
-    if name == "y flipped":
-        sign = torch.tensor([1.0, -1.0, 1.0], dtype=E.dtype)
-        return posed(views, sign[:, None] * R * sign, sign * t)
-    if name == "half a pixel":
-        return moved(views, torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]))
-    if name == "K of another resolution":
-        half = K.clone()
-        half[:, :2] *= 0.5
-        half[:, :2, 2] -= 0.25  # (c + 1/2) / 2 - 1/2
-        return views._replace(intrinsics=half)
+    """The mistake, as the page has it where it has a number or an order of its own."""
+    K, E = views.intrinsics, views.cam_from_world
     if name == "frames shuffled":
-        order = [2, 0, 1]
-        return views._replace(intrinsics=K[order], cam_from_world=E[order])
-    if name == "rotation transposed":
-        return posed(views, R.mT, t)
-    if name == "centre taken as translation":
-        return posed(views, R, -torch.einsum("vji,vj->vi", R, t))
-    if name == "focal length off":
-        return views._replace(intrinsics=K * torch.tensor([[2.0, 2.0, 1.0], [2.0, 2.0, 1.0], [1.0, 1.0, 1.0]]).to(K))
-    if name == "translation negated":
-        return posed(views, R, -t)
-    if name == "other camera axes":  # forward, left, up
-        return posed(
-            views, torch.stack((R[:, 2], -R[:, 0], -R[:, 1]), 1), torch.stack((t[:, 2], -t[:, 0], -t[:, 1]), 1)
-        )
-    raise AssertionError(name)
+        K, E = K[[2, 0, 1]], E[[2, 0, 1]]
+    elif name == "focal length off":
+        K = K * torch.tensor([[2.0, 2.0, 1.0], [2.0, 2.0, 1.0], [1.0, 1.0, 1.0]]).to(K)
+    elif name == "other camera axes":  # forward, left, up
+        E = torch.tensor([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]).to(E) @ E
+    else:
+        K, E = map(torch.from_numpy, mistaken(K.numpy(), E.numpy(), name))
+    return views._replace(intrinsics=K, cam_from_world=E)
 
 
 OF_CAMERAS = (

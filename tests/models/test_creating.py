@@ -10,7 +10,7 @@ import torch
 from lsmgeo.errors import DTypeError, OptionError
 from lsmgeo.models import Model, create, from_settings, settings_of
 from lsmgeo.models.creating import MODELS, PRESETS
-from tests.models.inputs import look
+from tests.models.inputs import count, look
 
 # So that a change of a preset's weights, which makes files of weights useless, is seen.
 COUNTS = {
@@ -28,7 +28,7 @@ COUNTS = {
 @pytest.mark.parametrize(("name", "preset"), COUNTS)
 def test_presets_have_their_counts_of_parameters(name, preset):
     model = create(name, preset=preset)
-    assert sum(weights.numel() for weights in model.parameters()) == COUNTS[name, preset]
+    assert count(model) == COUNTS[name, preset]
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -36,7 +36,7 @@ def test_tiny_models_say_what_they_are(name):
     model = create(name, preset="tiny")
     assert isinstance(model, Model)
     assert model.name == name
-    assert sum(weights.numel() for weights in model.parameters()) < 60_000
+    assert count(model) < 60_000
     size = model.image_size
     result = model.run(*look(1, 2, size))
     if model.output == "voxels":

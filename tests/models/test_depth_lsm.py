@@ -9,13 +9,9 @@ from lsmgeo import PlaneSweepProject, VoxelGrid, depth_planes
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.models import create
-from tests.models.inputs import look, some
+from tests.models.inputs import count, look, shapes_at, some
 from tests.models.released_layers import reduce_rays
 from tests.tolerances import BATCHED
-
-
-def count(module):
-    return sum(weights.numel() for weights in module.parameters())
 
 
 @pytest.fixture(scope="module")
@@ -44,23 +40,8 @@ def test_the_release_has_its_counts_of_parameters(release):
 
 
 def test_the_release_has_its_shapes_at_every_stage(release):
-    shapes = {}
-
-    def note(name):
-        def hook(module, given, made):
-            shapes[name] = tuple((made[0] if isinstance(made, tuple) else made).shape)
-
-        return hook
-
     stages = ("sweep", "rays.0", "rays.1", "rise.0", "rise.1", "out")
-    hooks = [release.get_submodule(name).register_forward_hook(note(name)) for name in stages]
-    images, cameras = look(1, 1, 224)
-    with torch.no_grad():
-        depth = release(images, cameras, steps="last").depth
-    for hook in hooks:
-        hook.remove()
-    assert tuple(depth.shape) == (1, 1, 1, 224, 224)
-    assert shapes == {
+    assert shapes_at(release, stages, *look(1, 1, 224)) == {
         "sweep": (1, 1, 2048, 56, 56),
         "rays.0": (1, 512, 56, 56),
         "rays.1": (1, 64, 56, 56),
@@ -161,40 +142,6 @@ def test_ragged_scenes_equal_their_scenes_alone(tiny):
             torch.testing.assert_close(found[scene, :views], alone[0, 0], rtol=0, atol=BATCHED)
     assert bool((found[1, 1:] == 0).all())
     assert bool((found[mask] != 0).all())
-
-
-def test_what_a_masked_view_holds_reaches_nothing(tiny):
-    mask = torch.tensor([[True, False, True]])
-
-    def everything(filling):
-        images, cameras = look(1, 3)
-        images[:, 1] = filling
-        poses = cameras.cam_from_world.clone()
-        poses[:, 1] = filling
-        images.requires_grad_()
-        tiny.zero_grad()
-        depth = tiny(images, cameras._replace(cam_from_world=poses), mask).depth
-        depth.square().sum().backward()
-        return [depth.detach(), images.grad, *(weights.grad.clone() for weights in tiny.parameters())]
-
-    clean, dirty = everything(0.5), everything(torch.nan)
-    assert all(torch.equal(ours, theirs) for ours, theirs in zip(clean, dirty, strict=True))
-    assert torch.equal(clean[1][:, 1], torch.zeros_like(clean[1][:, 1]))
-    assert all(bool(item.isfinite().all()) for item in clean)
-
-
-@pytest.mark.parametrize("kind", ["tiny", "free"])
-def test_every_weight_learns_and_gradients_reach_the_cameras(kind, request):
-    model = request.getfixturevalue(kind)
-    images, cameras = look(1, 3)
-    K, E = cameras.intrinsics.clone().requires_grad_(), cameras.cam_from_world.clone().requires_grad_()
-    model.zero_grad()
-    model(images, CameraTensors(K, E, cameras.height, cameras.width)).depth.square().mean().backward()
-    for name, weights in model.named_parameters():
-        assert float(weights.grad.abs().sum()) > 0, name
-    for gradient in (K.grad, E.grad):
-        assert bool(gradient.isfinite().all())
-        assert bool((gradient.abs().sum((-1, -2)) > 0).all())
 
 
 def test_views_that_are_no_input_can_be_predicted(free):

@@ -8,6 +8,7 @@ import torch
 
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
 from lsmgeo.fusion import ConvGRU3d, ConvLSTM3d
+from tests.models.inputs import count
 from tests.models.recurrences import run_gru, run_lstm
 from tests.tolerances import TERMWISE
 
@@ -117,9 +118,9 @@ def test_gradients_are_those_of_differences(recurrence):
 
 
 def test_counts_of_parameters():
-    assert sum(weights.numel() for weights in ConvGRU3d(33, 32).parameters()) == 168_672
+    assert count(ConvGRU3d(33, 32)) == 168_672
     # 27 (33 + 32) 4 32 weights, 5 norms of 2 x 32
-    assert sum(weights.numel() for weights in ConvLSTM3d(33, 32).parameters()) == 224_960
+    assert count(ConvLSTM3d(33, 32)) == 224_960
 
 
 @pytest.mark.parametrize("recurrence", RECURRENCES)

@@ -1,6 +1,8 @@
-"""The machines learn eight objects by heart."""
+"""The machines and 3D-R2N2 learn eight objects by heart."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -11,15 +13,17 @@ from lsmgeo.metrics import voxel_iou
 from lsmgeo.models import Model, compute_loss, create
 
 
-def learn(model: Model, batch: Batch, steps: int, rate: float) -> None:
+def learn(model: Model, batch: Batch, steps: int, rate: float, told: str | None = None) -> Iterator[int]:
     optimiser = torch.optim.Adam(model.parameters(), rate)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, steps, pct_start=0.1)
-    for _ in range(steps):
+    for step in range(steps):
         optimiser.zero_grad()
-        compute_loss(model(batch.images, batch.cameras, batch.view_mask), batch).backward()
+        found = model(batch.images, batch.cameras, batch.view_mask, steps=told)
+        compute_loss(found, batch, steps=told).backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimiser.step()
         schedule.step()
+        yield step
 
 
 def eight_objects(views: int) -> Batch:
@@ -32,7 +36,7 @@ def eight_objects(views: int) -> Batch:
 def test_voxels_of_eight_objects_are_learnt_by_heart():
     torch.manual_seed(0)
     model, batch = create("voxel-lsm", preset="tiny"), eight_objects(4)
-    learn(model, batch, 250, 1e-2)
+    list(learn(model, batch, 250, 1e-2))
     truth = batch.occupancy[:, None].expand(-1, 4, -1, -1, -1)
     found = voxel_iou(model.run(batch.images, batch.cameras).by_view, truth)
     print("IoU after 1 to 4 views", found.mean(0).tolist())
@@ -45,8 +49,22 @@ def test_voxels_of_eight_objects_are_learnt_by_heart():
 def test_depth_of_eight_objects_is_learnt_by_heart():
     torch.manual_seed(0)
     model, batch = create("depth-lsm", preset="tiny"), eight_objects(3)
-    learn(model, batch, 800, 1e-2)
+    list(learn(model, batch, 800, 1e-2))
     errors = (model.run(batch.images, batch.cameras).depth - batch.depth).abs()
     found = torch.stack([error[mask].mean() for error, mask in zip(errors, batch.mask, strict=True)])
     print("mean absolute depth error of each object", found.tolist())
     assert found.mean() < 0.01
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["r2n2", "r2n2-pose"])
+def test_r2n2_learns_voxels_of_eight_objects_by_heart(name):
+    torch.manual_seed(0)
+    model, batch = create(name, preset="tiny"), eight_objects(4)
+    for step in learn(model, batch, 1000, 3e-3, "last"):
+        if step % 50 == 49:
+            found = voxel_iou(model.run(batch.images, batch.cameras, by_view=False).occupancy, batch.occupancy)
+            if found.mean() > 0.95:
+                break
+    assert found.mean() > 0.9
+    assert found.min() > 0.8

@@ -7,6 +7,8 @@ import torch
 from lsmgeo.cameras import CameraTensors, orbit
 from lsmgeo.errors import CameraError, OptionError, ShapeError
 from lsmgeo.models import R2N2, create
+from tests.models.inputs import count
+from tests.models.recurrences import sigmoid
 
 SMALL = {
     "image_size": 9,
@@ -37,10 +39,6 @@ def scenes(B=2, V=3):
 
 def leaky(x):
     return np.where(x > 0, x, 0.01 * x)
-
-
-def sigmoid(x):
-    return 1 / (1 + np.exp(-x))
 
 
 def correlated(x, weight, bias):
@@ -155,9 +153,6 @@ def test_parameters_by_hand():
     decoder += (128 * 64 + 64 * 64) * 27 + 128 * 64 + 3 * 64
     decoder += (64 * 32 + 2 * 32 * 32) * 27 + 3 * 32 + (32 * 2 * 27 + 2)
     by_size = {127: 3, 224: 5}
-
-    def count(model):
-        return sum(parameter.numel() for parameter in model.parameters())
 
     with torch.device("meta"):
         for size, side in by_size.items():

@@ -288,11 +288,6 @@ def test_what_a_seed_gives_belongs_to_a_version():
     )
 
 
-def test_a_category_can_be_asked_for():
-    shape = synthetic13.shape(0, 5, "lamp")
-    assert (shape.category, shape.name) == ("lamp", "lamp-00000005")
-
-
 def test_views_look_at_the_origin_from_all_around():
     views = synthetic13.views(0, 7, 2000, 224)
     assert views.cam_from_world.dtype == torch.float64

@@ -343,11 +343,8 @@ def test_a_flipped_bit_is_never_read(run, name, count):
     assert load_latest(path.parent).config == before["config"]
 
 
-def test_two_damaged_ones_are_both_named(run):
-    training = Training()
-    training.resume(run)
-    training.advance()
-    training.save(run / "checkpoints")
+def test_two_damaged_ones_are_both_named(run, third):
+    third.save(run / "checkpoints")
     for step in (2, 3):
         damage(run / "checkpoints" / f"step_{step:08d}" / "state.pt", b"")
     with pytest.warns(UserWarning, match=r"step_00000003.*step_00000002.* Going back to .*step_00000001"):

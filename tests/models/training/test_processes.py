@@ -48,7 +48,7 @@ def test_two_processes_evaluate_the_same_set(plain, together):
     assert ours["loss"] == pytest.approx(theirs["loss"], rel=1e-3)
 
 
-def test_the_first_process_plain_writes(together):
+def test_the_first_process_alone_writes(together):
     lines = events(together)
     assert [line["event"] for line in lines].count("start") == 1
     assert len(events(together, "step")) == 3

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from benchmarks.classical_rivals import Found, bad_at, luminance, median_at, plain_sweep, winners
+from benchmarks.classical_rivals import luminance, plain_sweep
 from benchmarks.triangulated import Features, triangulate
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.grids import depth_planes
@@ -45,13 +45,3 @@ def test_the_plainest_sweep_finds_the_plane():
     step = 1 / depths[0] - 1 / depths[1]
     off = np.abs(1 / found.value - 1 / scene.depth[0])[3:-3, 3:-3] / step
     assert (off <= 1.0).mean() > 0.9
-
-
-def test_densities_are_of_all_pixels_in_the_order_of_confidence():
-    value = np.array([[1.0, 2.0, np.nan, 4.0], [5.0, 6.0, 7.0, 8.0]])
-    found = Found(value, np.array([[0.9, 0.1, 1.0, 0.8], [0.7, 0.6, 0.5, 0.4]]))
-    np.testing.assert_array_equal(winners(found, 0.25), [[True, False, False, True], [False] * 4])
-    assert int(winners(found, 1.0).sum()) == 7
-    true = np.array([[1.0, 5.0, 3.0, np.nan], [5.0, 9.0, 7.0, 8.0]])
-    np.testing.assert_allclose(bad_at(found, true, 0.5, 2.0), 1 / 3)
-    assert median_at(found, true, 0.375) == 0.0

@@ -70,10 +70,14 @@ test: $(VENV)/.dev ## whole suite, doctests, and the core's coverage
 	@$(BIN)/coverage report --include='$(CORE)' --omit='$(DEVICE_CODE)' --fail-under=$(CORE_COVERAGE)
 
 # An environment of the lowest versions that setup.cfg admits, of PyTorch, kornia and NumPy alone.
+# They have no wheels for Python 3.13.
 FLOORS := $(VENV)-floors
+FLOORS_PYTHON ?= $(shell for p in $(BIN)/python python3.11 python3.12 python3; do \
+	$$p -c 'import sys; sys.exit(sys.version_info[:2] > (3, 12))' 2>/dev/null && { echo $$p; break; }; done)
 $(FLOORS)/.made: setup.cfg | $(BIN)/python
+	@test -n "$(FLOORS_PYTHON)" || { echo 'the lowest versions need Python 3.11 or 3.12; name one: FLOORS_PYTHON=' >&2; exit 1; }
 	@echo 'installing the oldest PyTorch, kornia and NumPy into $(FLOORS) (once; PyTorch is large)'
-	$(BIN)/python -m venv --clear $(FLOORS)
+	$(FLOORS_PYTHON) -m venv --clear $(FLOORS)
 	$(call install,$(FLOORS)/bin,$$(sed -nE 's/^ +((torch|kornia|numpy))>=/\1==/p; s/^ +((pytest|hypothesis).*)/\1/p' setup.cfg))
 	@touch $@
 
@@ -81,7 +85,7 @@ $(FLOORS)/.made: setup.cfg | $(BIN)/python
 # compiler is found) and without Triton. The checkout is out of sight, so that what is installed is what is tested.
 CORE_MODULES := $(addprefix lsmgeo.,cameras kernels grids functional layers fusion rays)
 test-floors: $(FLOORS)/.made ## the operators' tests at the lowest versions, installed beside PyTorch, kornia and NumPy alone
-	@rm -rf build/lib build/floors && mkdir -p build/floors && ln -s ../../tests ../../setup.cfg build/floors
+	@rm -rf build/lib* build/floors && mkdir -p build/floors && ln -s ../../tests ../../setup.cfg build/floors
 	CC=false CXX=false $(FLOORS)/bin/python -m pip install --quiet --no-deps --force-reinstall .
 	cd build/floors && LSMGEO_NATIVE=0 LSMGEO_TEST_WITHOUT_TRITON=1 HYPOTHESIS_PROFILE=dev OMP_NUM_THREADS=1 \
 		$(abspath $(FLOORS))/bin/python -m pytest -n $(JOBS) --dist worksteal -m 'not long' --pyargs \

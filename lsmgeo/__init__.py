@@ -45,7 +45,7 @@ if not TYPE_CHECKING:
     def __getattr__(name: str) -> object:
         from importlib import import_module
 
-        if name not in __all__:
+        if name not in __all__ and name not in _HOMES.values():
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         module = import_module(f"{__name__}.{_HOMES.get(name, name)}")
         value = globals()[name] = getattr(module, name) if name in _HOMES else module

@@ -255,7 +255,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             return _run(arguments)
         finally:
-            sys.stdout.flush()
+            if sys.stdout is not None and not sys.stdout.closed:
+                sys.stdout.flush()
     except ArgumentError as error:
         print(f"lsmgeo: error: {_reason(str(error))} (see lsmgeo --help)", file=sys.stderr)
         return 2

@@ -1,4 +1,4 @@
-"""Drawing primitives: figures as PNG, pictures in rows, and voxels, depth and points shaded by NumPy alone."""
+"""Drawing primitives: figures as PNG, pictures in rows, voxels shaded by NumPy alone, depth and points."""
 
 from __future__ import annotations
 

@@ -363,6 +363,10 @@ def depth_planes(near: float | Tensor, far: float | Tensor, num: int, spacing: s
     else:
         planes = torch.exp((1.0 - a) * torch.log(first) + a * torch.log(last))
     planes = torch.cat((ends[0], planes[..., 1:-1].to(dtype), ends[1]), -1)  # the ends exactly
+    # Programs that a graph is exported to, ONNX among them, cannot look at bits. (Older PyTorch does not tell.)
+    is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)
+    if torch.jit.is_tracing() or is_exporting():  # type: ignore[attr-defined]
+        return planes
     # Rounding may leave neighbours equal. Positive numbers are ordered as the integers of the same bits.
     integers = {2: torch.int16, 4: torch.int32, 8: torch.int64}[planes.element_size()]
     count = torch.arange(num, device=planes.device)

@@ -134,13 +134,15 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh) -> Path:
         The path written.
 
     Raises:
-        OptionError: another ending.
+        OptionError: another ending, or colours of faces.
         DataError: the mesh has no face, or the file cannot be written.
     """
     kind = Path(path).suffix[1:].lower()
     if kind not in ("ply", "glb"):
         raise OptionError(f"write_mesh: path must end in .ply or .glb; got {os.fspath(path)!r}")
     check_mesh("write_mesh", mesh, least=0)
+    if mesh.face_colours is not None:
+        raise OptionError("write_mesh: mesh must have colours of its vertices, not of its faces, which are not written")
     if len(mesh.faces) == 0:
         raise DataError(path, "the mesh has no face")
     import trimesh

@@ -29,6 +29,7 @@ __all__ = [
     "atomic_folder",
     "child",
     "clear_leftovers",
+    "is_abandoned",
     "one_file",
     "parse_floats",
     "parse_ints",
@@ -230,6 +231,7 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[AtomicFile]:
         with refusing(path):
             _make_folder(path.parent)
             descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
+            _lock(descriptor)
         yield AtomicFile(path, descriptor)
         with refusing(path):
             os.fsync(descriptor)
@@ -273,21 +275,46 @@ def atomic_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Ite
         DataError: something is there already, or the folder cannot be written. Errors of the block pass unchanged.
     """
     path = Path(path)
-    temporary = _beside(path)
+    temporary, is_current = _beside(path), False
     try:
         with refusing(path):
             if not replace and (path.is_symlink() or (path.exists() and (not path.is_dir() or any(path.iterdir())))):
                 raise DataError(path, "is there already and not an empty folder; name a new one")
-            if path.resolve() == Path.cwd():
+            with contextlib.suppress(FileNotFoundError):
+                is_current = path.samefile(".")
+            if is_current:
                 raise DataError(path, "is the current folder, which cannot be replaced; name a new one")
             _make_folder(path.parent)
             temporary.mkdir()
         yield temporary
         with refusing(path):
-            _take_place(temporary, path)
+            _take_place(temporary, path) if replace else temporary.replace(path)
             _sync_folder(path.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def is_abandoned(temporary: Path) -> bool:
+    """Whether the writer of a temporary file of `atomic_file` is gone: its lock ends with its process."""
+    descriptor = os.open(temporary, os.O_RDONLY)
+    try:
+        return _lock(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int) -> bool:
+    """Take a file's lock; False where another process has it. Systems without locks always give it."""
+    with contextlib.suppress(ImportError):
+        import fcntl
+
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:
+            pass
+    return True
 
 
 def remove_folder(folder: Path) -> None:
@@ -359,7 +386,7 @@ def _sync_folder(folder: Path) -> None:
         finally:
             os.close(descriptor)
     except OSError as error:
-        if error.errno not in (errno.EACCES, errno.EINVAL, errno.ENOTSUP):
+        if error.errno in (errno.EIO, errno.ENOSPC, errno.EDQUOT):  # others: a system that syncs no folders
             raise
 
 

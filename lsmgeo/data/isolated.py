@@ -27,7 +27,8 @@ __all__ = ["isolated"]
 
 Arrays = dict[str, np.ndarray]
 
-MOST_ANSWERED = 1 << 28
+MOST_ANSWERED = 1 << 30
+MOST_ASKED = 1 << 26
 MOST_NAMES = 1 << 20
 
 
@@ -61,18 +62,23 @@ def isolated(
     from lsmgeo.data.files import read_bytes
     from lsmgeo.errors import DataError
 
-    answers: dict[int, Arrays | DataError] = {}
-    files = []
-    for number, path in enumerate(paths):
-        try:
-            files.append((number, path, read_bytes(path, limit)))
-        except DataError as error:
-            answers[number] = error
-    while files:
-        found = _ask(function, [file[1:] for file in files], arguments, memory, seconds)
-        answers |= {file[0]: answer for file, answer in zip(files, found, strict=False)}
-        files = files[len(found) :]
-    return [answers[number] for number in range(len(paths))]
+    answers: list[Arrays | DataError] = []
+    while len(answers) < len(paths):
+        files: list[tuple[Path, bytes]] = []
+        refused: DataError | None = None
+        # One process's files are held at once: as many as have 64 MiB together, or one that has more.
+        for path in paths[len(answers) :]:
+            try:
+                files.append((path, read_bytes(path, limit)))
+            except DataError as error:
+                refused = error
+            if refused or sum(len(content) for _, content in files) > MOST_ASKED:
+                break
+        found = _ask(function, files, arguments, memory, seconds) if files else []
+        answers += found
+        if refused and len(found) == len(files):
+            answers.append(refused)
+    return answers
 
 
 def _ask(
@@ -82,13 +88,14 @@ def _ask(
     from lsmgeo.errors import DataError
 
     order = json.dumps([memory, seconds, inspect.getsourcefile(function), function.__name__, arguments])
-    content = b"".join(len(content).to_bytes(8, "little") + content for _, content in files)
+    parts = (order.encode(), *(content for _, content in files))
+    content = b"".join(len(part).to_bytes(8, "little") + part for part in parts)
     # Threads of linear algebra reserve address space for nothing.
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     with tempfile.TemporaryFile() as output:
         try:
             code = subprocess.run(
-                [sys.executable, "-I", "-B", __file__, order],
+                [sys.executable, "-I", "-B", __file__],
                 input=content,
                 stdout=output,
                 stderr=subprocess.DEVNULL,
@@ -143,8 +150,15 @@ def _reason(code: int, seconds: float) -> str:
     return f"took its parser more than {seconds:g} seconds" if name == "SIGALRM" else f"crashed its parser ({name})"
 
 
-def _serve(memory: int, seconds: float, source: str, name: str, arguments: list[object]) -> None:
-    """In the process: answer for every file on standard input."""
+def _next() -> bytes | None:
+    """The next part of standard input, None at its end."""
+    header = sys.stdin.buffer.read(8)
+    return sys.stdin.buffer.read(int.from_bytes(header, "little")) if header else None
+
+
+def _serve() -> None:
+    """In the process: read what is asked on standard input, and answer for every file after it."""
+    memory, seconds, source, name, arguments = json.loads(_next() or b"")
     with contextlib.suppress(ImportError):
         import resource
 
@@ -157,8 +171,7 @@ def _serve(memory: int, seconds: float, source: str, name: str, arguments: list[
     output, sys.stdout = sys.stdout.buffer, sys.stderr  # what a library prints is no answer
     function = runpy.run_path(source)[name]
     alarm = getattr(signal, "setitimer", None)
-    while header := sys.stdin.buffer.read(8):
-        content = sys.stdin.buffer.read(int.from_bytes(header, "little"))
+    while (content := _next()) is not None:
         if alarm is not None:  # of which the process dies
             alarm(signal.ITIMER_REAL, seconds)
         answer = io.BytesIO()
@@ -180,4 +193,4 @@ def _serve(memory: int, seconds: float, source: str, name: str, arguments: list[
 
 
 if __name__ == "__main__":
-    _serve(*json.loads(sys.argv[1]))
+    _serve()

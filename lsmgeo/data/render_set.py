@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 
 from lsmgeo._checks import check_choice, check_flag, check_whole
+from lsmgeo.data.files import is_abandoned
 from lsmgeo.data.members import encode_sample
 from lsmgeo.data.metadata import MAX_SIDE, MAX_VIEWS, MAX_VOXELS
 from lsmgeo.data.shards import hash_settings, verify_shard, write_shard
@@ -150,7 +151,8 @@ def make_set(
     half_written = f".{glob.escape(source.name)}-{'[0-9]' * 6}.*.tmp"
     try:
         (out / PROGRESS).mkdir(parents=True, exist_ok=True)
-        for path in (*told, *out.glob(half_written)):  # a run that was killed left them
+        left = [path for path in out.glob(half_written) if is_abandoned(path)]  # by a run that was killed
+        for path in (*told, *left):
             path.unlink(missing_ok=True)
     except OSError as error:
         raise DataError(out, f"cannot be written ({error})") from error

@@ -115,3 +115,12 @@ def test_many_threads_may_have_processes(tmp_path):
     for thread in threads:
         thread.join()
     assert answers == {0: 0, 1: 1, 2: 2}
+
+
+def test_files_that_are_large_together_are_held_in_turn(tmp_path, monkeypatch):
+    monkeypatch.setattr("lsmgeo.data.isolated.MOST_ASKED", 3)
+    answers = run(
+        tmp_path, "return {'a': np.array(len(content))}", [b"12", b"1234", bytes(101), b"", b"123"], limit=100
+    )
+    assert [answer["a"] for answer in answers if not isinstance(answer, DataError)] == [2, 4, 0, 3]
+    assert "larger than the limit" in str(answers[2])

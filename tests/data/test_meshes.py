@@ -223,3 +223,11 @@ def test_polygons_of_differing_length_are_read_from_text(tmp_path):
     mesh = load(tmp_path, "cube.ply", "\n".join([head + "end_header", *rows]).encode())
     np.testing.assert_array_equal(corners(mesh), writers.CUBE[writers.FANS])
     np.testing.assert_allclose(mesh.face_colours, np.tile([0.2, 0.4, 0.6], (12, 1)), atol=1e-6)
+
+
+def test_materials_in_any_number_reach_an_isolated_parser(tmp_path):
+    names = [f"material_{number:05d}_{'x' * 40}" for number in range(3000)]
+    (tmp_path / "many.mtl").write_text("".join(f"newmtl {name}\nKd 0.5 0 0\n" for name in names))
+    path = tmp_path / "many.obj"
+    path.write_text(f"mtllib many.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl {names[-1]}\nf 1 2 3\n")
+    np.testing.assert_allclose(load_mesh(path, guarded=True).face_colours, [[0.5, 0, 0]])

@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 
 from lsmgeo import data
+from lsmgeo.data.files import atomic_file, atomic_folder, is_abandoned
 from lsmgeo.errors import DataError, OptionError
 from tests.data.posed_writers import trimmed, write_plain_cameras, write_transforms
 from tests.data.writers import project, write_colmap
@@ -192,3 +193,23 @@ def test_names_lead_nowhere_else(scene, tmp_path):
     read = data.open(folder)
     assert read.names[:2] == ("images/a.png", "images/etc/b.png")
     assert sorted(os.listdir(tmp_path)) == ["out", "source"]
+
+
+def test_a_folder_that_is_filled_meanwhile_keeps_what_it_holds(tmp_path):
+    writing = atomic_folder(tmp_path / "scene")
+    (writing.__enter__() / "mine").write_text("mine")
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "theirs").write_text("theirs")
+    with pytest.raises(DataError, match="scene"):
+        writing.__exit__(None, None, None)
+    assert [path.name for path in tmp_path.rglob("*")] == ["scene", "theirs"]
+
+
+def test_a_temporary_file_is_abandoned_when_its_writer_has_gone(tmp_path):
+    with atomic_file(tmp_path / "file") as stream:
+        stream.write(b"half")
+        (temporary,) = tmp_path.glob(".file.*.tmp")
+        assert not is_abandoned(temporary)
+    left = tmp_path / ".file.0123abcd.tmp"
+    left.write_bytes(b"half")
+    assert is_abandoned(left)

@@ -259,3 +259,9 @@ def test_fusion_modules_are_the_statistics(name):
     )
     expected = oracle.view_statistics(values.flatten(3).numpy(), visible.flatten(2).numpy(), (name,))
     support.assert_within(support.array(module(values, visible).flatten(2)), expected, 1e-12)
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::torch.jit.TracerWarning", "ignore::DeprecationWarning")
+def test_depth_planes_can_be_traced():
+    traced = torch.jit.trace(lambda far: depth_planes(1.0, far, 5, spacing="inverse"), torch.tensor(4.0))
+    torch.testing.assert_close(traced(torch.tensor(8.0)), depth_planes(1.0, 8.0, 5, spacing="inverse"))

@@ -49,7 +49,8 @@ def load_mesh(
     over, as ShapeNet lacks some); of glTF, transforms, baseColorFactor and vertex colours of the scene.
     No textures: a face that has only a texture is grey, or has its material's plain colour. Vertices that no face uses
     are dropped; nothing is moved, merged or repaired. What is refused: a binary PLY with lists of differing length, as
-    of triangles and quads (save it as text), a glTF with strips, fans, sparse or compressed data, or without a scene.
+    of triangles and quads (save it as text), a PLY whose faces have a second list, a glTF
+    with strips or fans, of lines too, with sparse or compressed data, or without a scene.
 
     Args:
         path: the file; its ending names the format and its content must agree.
@@ -86,23 +87,25 @@ def load_mesh(
         raise DataError(path, f"is no mesh that can be read; expected a name that ends in one of {', '.join(KINDS)}")
     content = read_bytes(path, max_bytes)
     options = (kind, max_faces, _material_colours(path, content) if kind == "obj" else {})
-    if guarded:
+    try:
+        if not guarded:
+            return _checked(path, parse_mesh(content, *options), max_faces)
         memory = GUARD_MEMORY + GUARD_MEMORY_OF_A_BYTE * len(content)
         (found,) = isolated(parse_mesh, [path], *options, limit=max_bytes, memory=memory, seconds=GUARD_SECONDS)
-        if isinstance(found, DataError):
-            raise found
-        return _checked(path, found, max_faces)
-    try:
-        return _checked(path, parse_mesh(content, *options), max_faces)
     except ValueError as error:
         raise DataError(path, str(error)) from error
+    if isinstance(found, DataError):
+        raise found
+    return _checked(path, found, max_faces)
 
 
 def _checked(path: Path, parsed: Mapping[str, np.ndarray], max_faces: int) -> Mesh:
     """A mesh of the vertices that faces use; what a parser says is believed no more than the file."""
     try:
         whole = Mesh(parsed["vertices"], parsed["faces"])
-    except (LsmGeoError, KeyError) as error:
+        with np.errstate(over="ignore"):
+            colours = parsed["colours"].astype(np.float32).reshape(whole.faces.shape)
+    except (LsmGeoError, KeyError, ValueError) as error:
         raise DataError(path, f"holds no mesh ({error})") from error
     if not len(whole.faces) or len(whole.faces) > max_faces:
         raise DataError(path, f"holds no face, or more than the limit of {max_faces}; got {len(whole.faces)}")
@@ -115,7 +118,6 @@ def _checked(path: Path, parsed: Mapping[str, np.ndarray], max_faces: int) -> Me
     size = np.ptp(vertices, 0).max()
     if not (np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-14 * size * size).any():
         raise DataError(path, "has no face with an area")
-    colours = parsed["colours"].astype(np.float32)
     known = np.asarray(np.isfinite(colours).all(1))
     if not known.any():
         return Mesh(vertices, faces)

@@ -7,6 +7,7 @@ an OFF that are cut short.
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import re
@@ -228,6 +229,10 @@ def _gltf(content: bytes, max_faces: int, text: Any) -> Parsed:
         raise Unreadable(f"requires the extension {required[0][:60]}, which is not read")
     if any(not str(buffer.get("uri", "data:")).startswith("data:") for buffer in buffers):
         raise Unreadable("has a buffer outside the file, which is not read")
+    for buffer in buffers:
+        told, text_of_it = _whole(buffer["byteLength"]), buffer.get("uri", "").partition(",")[2]
+        if "uri" in buffer and len(base64.b64decode(text_of_it, validate=True)) < told:
+            raise Unreadable(f"has a buffer of fewer bytes than the {told} that it announces")
     if any("sparse" in accessor or "bufferView" not in accessor for accessor in accessors):
         raise Unreadable("has a sparse or empty accessor, which is not read")
     # trimesh itself compares these with the buffers by assertions, which Python may be told to leave out.
@@ -238,7 +243,7 @@ def _gltf(content: bytes, max_faces: int, text: Any) -> Parsed:
     if sum(held) + sum(view["byteLength"] for view in views) > 8 * len(content):
         raise Unreadable("announces more than it can hold")
     if any(
-        primitive.get("mode", 4) not in (0, 1, 3, 4) or DRACO in primitive.get("extensions", {})
+        primitive.get("mode", 4) not in (0, 1, 4) or DRACO in primitive.get("extensions", {})
         for primitive in primitives
     ):
         raise Unreadable("has strips, fans or compressed triangles, which are not read")

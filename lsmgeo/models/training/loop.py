@@ -41,7 +41,7 @@ from lsmgeo.models.training.optimising import (
     make_optimiser,
     move_parameters,
 )
-from lsmgeo.models.weights import CHECKPOINTS, checksum, fill_model, step_folder, tensors_of
+from lsmgeo.models.weights import CHECKPOINTS, checkpoint_folders, checksum, fill_model, step_folder, tensors_of
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -115,6 +115,7 @@ def train(config: TrainingConfig, out: str | os.PathLike[str], *, quiet: bool = 
             another process trains in the folder.
     """
     folder = Path(out)
+    seen = list(checkpoint_folders(folder))
     checkpoint = load_latest(folder)
     config = decided(config, checkpoint)
     # One layer of the release never gets a gradient, and what convolves the state gets none from a single view.
@@ -125,13 +126,14 @@ def train(config: TrainingConfig, out: str | os.PathLike[str], *, quiet: bool = 
         started(config.run, has_idle_parameters=has_idle_parameters) as accelerator,
         catch_stop() as stop,
     ):
-        return _train(config, folder, checkpoint, accelerator, stop, quiet=quiet)
+        return _train(config, folder, checkpoint, seen, accelerator, stop, quiet=quiet)
 
 
 def _train(
     config: TrainingConfig,
     folder: Path,
     checkpoint: Checkpoint | None,
+    seen: list[int],
     accelerator: Accelerator,
     stop: StopRequest,
     *,
@@ -255,6 +257,8 @@ def _train(
         contextlib.closing(batches),
     ):
         if rank == 0:
+            if list(checkpoint_folders(folder)) != seen:
+                raise TrainingError(f"another process has trained in {folder} while this one started")
             write_config()
         log.event(
             "start" if checkpoint is None else "resume",

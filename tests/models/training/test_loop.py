@@ -7,6 +7,7 @@ import dataclasses
 import itertools
 import math
 import os
+import shutil
 import time
 from unittest import mock
 
@@ -28,6 +29,7 @@ from lsmgeo.models.training import (
     RunConfig,
     TrainingConfig,
     launch,
+    loop,
     optimising,
     read_config,
 )
@@ -246,6 +248,20 @@ def test_weights_to_begin_with(shards, plain, tmp_path):
     other = {**config.model.settings, "hidden_channels": 8}
     with pytest.raises(OptionError, match="weights are of another model: hidden_channels is 4 in"):
         run(dataclasses.replace(begun, model=dataclasses.replace(begun.model, settings=other)), tmp_path / "other")
+
+
+def test_a_run_that_another_process_began_meanwhile_is_left_alone(shards, tmp_path, monkeypatch):
+    run(configure(shards, steps=2), tmp_path / "other")
+    make = loop.make_model
+
+    def make_model(*arguments):
+        shutil.copytree(tmp_path / "other", tmp_path / "run")
+        return make(*arguments)
+
+    monkeypatch.setattr(loop, "make_model", make_model)
+    with pytest.raises(TrainingError, match="another process has trained in"):
+        run(configure(shards, seed=9), tmp_path / "run")
+    assert (tmp_path / "run" / "config.json").read_bytes() == (tmp_path / "other" / "config.json").read_bytes()
 
 
 def test_two_runs_do_not_share_a_folder(shards, tmp_path):

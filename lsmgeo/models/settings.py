@@ -47,11 +47,11 @@ def check_settings(who: str, settings: Any, whole: Limits = (1, LARGEST_SIDE), *
         try:
             object.__setattr__(settings, item.name, _converted(value, kinds[item.name], least, most))
         except TypeError:
+            if "..." in words:
+                words += f" of length 1 to {LONGEST_LIST}"
             if "int" in words or "float" in words:
                 bounds = f"at least {least}" if most >= 2**63 - 1 else f"from {least} to {most}"
                 words += f", {'above 0' if least == math.ulp(0.0) else bounds}"
-            if "..." in words:
-                words += f", of 1 to {LONGEST_LIST}"
             raise OptionError(f"{who}: {item.name} must be {words}; got {describe(value)}") from None
 
 

@@ -107,10 +107,13 @@ def test_every_model_has_the_four_presets():
             lambda: create("voxel-lsm", preset="tiny", encoder_channels=()),
             r"encoder_channels must be tuple\[int, ...\]",
         ),
-        (lambda: create("r2n2", preset="tiny", decoder=[4] * 65), r"decoder must be tuple\[int, ...\], from 1 to 4096"),
+        (
+            lambda: create("r2n2", preset="tiny", decoder=[4] * 65),
+            r"decoder must be tuple\[int, ...\] of length 1 to 64, from 1 to 4096",
+        ),
         (
             lambda: create("voxel-lsm", preset="tiny", encoder_channels=(8, 0)),
-            r"encoder_channels must be tuple\[int, ...\], from 1 to 4096; got tuple \(8, 0\)",
+            r"encoder_channels must be tuple\[int, ...\] of length 1 to 64, from 1 to 4096; got tuple \(8, 0\)",
         ),
         (
             lambda: create("voxel-lsm", preset="tiny", fusion="mean"),

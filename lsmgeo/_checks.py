@@ -158,9 +158,7 @@ def is_whole(value: Any) -> TypeGuard[int]:
 
 def check_positive(who: str, name: str, value: Any) -> float:
     """Require a finite number above 0."""
-    if not check_number(who, name, value, "a positive number") > 0:
-        raise OptionError(f"{who}: {name} must be a positive number; got {describe(value)}")
-    return float(value)
+    return check_number(who, name, value, "a positive number", math.ulp(0.0))
 
 
 def check_whole(who: str, name: str, value: Any, least: int, most: int = 2**63 - 1) -> int:

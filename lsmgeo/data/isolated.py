@@ -62,23 +62,25 @@ def isolated(
     from lsmgeo.data.files import read_bytes
     from lsmgeo.errors import DataError
 
-    answers: list[Arrays | DataError] = []
-    while len(answers) < len(paths):
-        files: list[tuple[Path, bytes]] = []
-        refused: DataError | None = None
-        # One process's files are held at once: as many as have 64 MiB together, or one that has more.
-        for path in paths[len(answers) :]:
-            try:
-                files.append((path, read_bytes(path, limit)))
-            except DataError as error:
-                refused = error
-            if refused or sum(len(content) for _, content in files) > MOST_ASKED:
+    answers: dict[int, Arrays | DataError] = {}
+    waiting = list(enumerate(paths))
+    while waiting:
+        # One process's files are held at once: until they have 64 MiB together.
+        files, held = [], 0
+        for number, path in waiting:
+            if held > MOST_ASKED:
                 break
-        found = _ask(function, files, arguments, memory, seconds) if files else []
-        answers += found
-        if refused and len(found) == len(files):
-            answers.append(refused)
-    return answers
+            try:
+                content = read_bytes(path, limit)
+            except DataError as error:
+                answers[number] = error
+                continue
+            files.append((number, path, content))
+            held += len(content)
+        found = _ask(function, [file[1:] for file in files], arguments, memory, seconds) if files else []
+        answers |= {file[0]: answer for file, answer in zip(files, found, strict=False)}
+        waiting = [one for one in waiting if one[0] not in answers]
+    return [answers[number] for number in range(len(paths))]
 
 
 def _ask(

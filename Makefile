@@ -15,7 +15,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 CORE := lsmgeo/_*.py,lsmgeo/errors.py,lsmgeo/debugging.py,lsmgeo/grids.py,lsmgeo/functional.py,lsmgeo/layers.py,lsmgeo/fusion.py,lsmgeo/rays.py,lsmgeo/cameras/*,lsmgeo/kernels/*
 CORE_COVERAGE := 95
 # Triton compiles these: their lines do not run as Python, and tests/kernels/test_triton*.py hold them by their answers.
-DEVICE_CODE := lsmgeo/kernels/gpu_kernels.py,lsmgeo/kernels/gpu_gradients.py
+DEVICE_CODE := lsmgeo/kernels/triton/forward.py,lsmgeo/kernels/triton/backward.py
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-floors test-long lint docs bench wheel clean
@@ -116,6 +116,6 @@ wheel: $(VENV)/.core ## build the wheel, install it into a clean environment, ru
 	@ls -l dist
 
 clean: ## remove what the commands wrote and built; what was installed from elsewhere stays
-	rm -rf build dist *.egg-info lsmgeo/kernels/_native.* $(VENV)/.core $(VENV)/.dev demo docs/_build docs/auto_examples docs/api/generated docs/sg_execution_times.rst
+	rm -rf build dist *.egg-info lsmgeo/kernels/native/_native.* $(VENV)/.core $(VENV)/.dev demo docs/_build docs/auto_examples docs/api/generated docs/sg_execution_times.rst
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage .coverage.* htmlcov
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +

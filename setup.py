@@ -11,7 +11,7 @@ HEADERS = ("call", "resample", "vectors", "places", "forward", "backward")
 setup(
     ext_modules=[
         Extension(
-            "lsmgeo.kernels._native",
+            "lsmgeo.kernels.native._native",
             [f"{NATIVE}/kernels.cpp"],
             depends=[f"{NATIVE}/{name}.h" for name in HEADERS],
             language="c++",

@@ -15,7 +15,8 @@ from benchmarks.problems import LeftOut, Run, Scene, channels_last
 from lsmgeo import functional, rays
 from lsmgeo._sites import image_sites, sweep_sites
 from lsmgeo.cameras import CameraTensors
-from lsmgeo.kernels import Options, cpu
+from lsmgeo.kernels import Options
+from lsmgeo.kernels.native import library
 
 OURS = "lsmgeo"
 REFERENCE = "lsmgeo, reference"
@@ -83,15 +84,15 @@ def kernel(scene: Scene) -> dict[str, Callable[[], Any]]:
     reduce, is_sweep = problem.statistic or None, problem.is_sweep
     options = Options.checked("benchmark", "trilinear" if is_sweep else "bilinear", mode_of(scene), reduce=reduce)
     options = options._replace(stacked=problem.flatten)
-    if reason := cpu.why_not("plane_sweep_project" if is_sweep else "unproject", source, options):
+    if reason := library.why_not("plane_sweep_project" if is_sweep else "unproject", source, options):
         raise LeftOut(reason)
     if is_sweep:
         where = scene.cameras, scene.grid, scene.depths, (problem.size,) * 2
         sites = sweep_sites("benchmark", source, *where, None, options)
-        forward, backward, axis = cpu.volume, cpu.volume_backward, 1
+        forward, backward, axis = library.volume, library.volume_backward, 1
     else:
         sites = image_sites("benchmark", source, scene.cameras, scene.grid, None, options)
-        forward, backward, axis = cpu.images, cpu.images_backward, 2
+        forward, backward, axis = library.images, library.images_backward, 2
     out, _ = forward(source, sites, options)
     gradient = scene.cotangent(out)
     into = channels_last(torch.zeros(source.shape), axis)
@@ -111,8 +112,8 @@ def floors(count: int) -> dict[str, Callable[[], Any]]:
     faults.
     """
     shape = (count // 4,)
-    buffer = cpu.fresh(shape, torch.float32)
-    return {COLD: lambda: cpu.fresh(shape, torch.float32).fill_(1.0), WARM: lambda: buffer.fill_(1.0)}
+    buffer = library.fresh(shape, torch.float32)
+    return {COLD: lambda: library.fresh(shape, torch.float32).fill_(1.0), WARM: lambda: buffer.fill_(1.0)}
 
 
 CONTENDERS: Mapping[str, Callable[[Scene], Run]] = {

@@ -26,7 +26,7 @@ PLOTS = {"benchmark_growth": "growth", "classical_density": "classical", "traini
 # What the drawings and tables of the models are made from.
 SOURCES = [
     *sorted((ROOT / "lsmgeo" / "models").glob("*.py")),
-    ROOT / "lsmgeo" / "models" / "training" / "config.py",
+    ROOT / "lsmgeo" / "training" / "config.py",
     *(ROOT / "docs" / name for name in ("model_tables.py", "network_tracing.py")),
 ]
 

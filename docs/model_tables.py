@@ -17,7 +17,7 @@ from sphinx.util.docutils import SphinxDirective
 from benchmarks.experiments import collecting, queue
 from lsmgeo.models import create
 from lsmgeo.models.creating import PRESETS, RELEASES
-from lsmgeo.models.training import config as configuration
+from lsmgeo.training import config as configuration
 
 GROUPS = configuration.GROUPS
 
@@ -183,7 +183,7 @@ class Curve(SphinxDirective):
 def name_fault(
     role: str, raw: str, text: str, line: int, inliner: Any, options: Any = None, content: Any = None
 ) -> tuple[list[nodes.Node], list[nodes.Node]]:
-    """A test of tests/models/training by the words of its name."""
+    """A test of tests/training by the words of its name."""
     words = text.rpartition("::")[2].removeprefix("test_").replace("_", " ")
     return [nodes.emphasis(raw, words)], []
 

@@ -13,7 +13,7 @@ import sys
 from lsmgeo.data import Recipe, ShapeDataset, ShardSet, collate, render_set
 from lsmgeo.metrics import median_depth_error
 from lsmgeo.models import load
-from lsmgeo.models.training import DataConfig, ModelConfig, OptimiserConfig, RunConfig, TrainingConfig, train
+from lsmgeo.training import DataConfig, ModelConfig, OptimiserConfig, RunConfig, TrainingConfig, train
 
 out = sys.argv[1] if len(sys.argv) > 1 else "runs/dlsm_example"
 

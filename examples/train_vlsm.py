@@ -15,7 +15,7 @@ import torch
 from lsmgeo.data import Recipe, ShapeDataset, ShardSet, collate, render_set
 from lsmgeo.metrics import voxel_iou
 from lsmgeo.models import load
-from lsmgeo.models.training import DataConfig, ModelConfig, OptimiserConfig, RunConfig, TrainingConfig, train
+from lsmgeo.training import DataConfig, ModelConfig, OptimiserConfig, RunConfig, TrainingConfig, train
 
 out = sys.argv[1] if len(sys.argv) > 1 else "runs/vlsm_example"
 

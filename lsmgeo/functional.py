@@ -29,7 +29,7 @@ from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import GridError, OptionError, ShapeError
 from lsmgeo.grids import VoxelGrid
 from lsmgeo.kernels.request import STATISTICS, Options
-from lsmgeo.kernels.statistics import view_statistics as _view_statistics
+from lsmgeo.kernels.view_statistics import view_statistics as _view_statistics
 
 __all__ = [
     "Projected",

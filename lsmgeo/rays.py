@@ -30,7 +30,7 @@ from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
 from lsmgeo.functional import Names, Projected
 from lsmgeo.grids import VoxelGrid, check_constant_depths
 from lsmgeo.kernels.request import Options
-from lsmgeo.kernels.statistics import first_maximum
+from lsmgeo.kernels.view_statistics import first_maximum
 
 __all__ = ["Composited", "ProjectReduce", "composite", "expected_depth", "max_along_rays", "project_reduce"]
 

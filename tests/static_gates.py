@@ -39,7 +39,7 @@ GATES = [
 AT_HOME = {
     r"\bgrid_sample\s*\(": ("lsmgeo/kernels/",),
     # Runs in an isolated process, which it may crash.
-    r"\bloadmat\s*\(": ("lsmgeo/data/mat_files.py",),
+    r"\bloadmat\s*\(": ("lsmgeo/data/formats/mat_files.py",),
 }
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from lsmgeo.data import Recipe
-from lsmgeo.models.training import TrainingConfig
-from lsmgeo.models.training.config import make_config
+from lsmgeo.training import TrainingConfig
+from lsmgeo.training.config import make_config
 
 __all__ = ["ALL", "EVALUATION_MINUTES", "QUEUE", "SET", "SHAPES", "Experiment", "find"]
 

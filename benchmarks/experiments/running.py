@@ -18,17 +18,18 @@ from tqdm import tqdm
 
 from benchmarks import measuring
 from benchmarks.experiments.queue import SET, SHAPES, Experiment
+from lsmgeo import evaluation, training
 from lsmgeo.data import Batch, ShardSet, render_set, write_atomic
 from lsmgeo.errors import OptionError
+from lsmgeo.evaluation.held_out_shapes import batches
+from lsmgeo.evaluation.report import finite
 from lsmgeo.metrics import DepthError, VoxelIoU
-from lsmgeo.models import Model, evaluation, load, training
-from lsmgeo.models.evaluation.report import finite
-from lsmgeo.models.evaluation.shapes import batches
-from lsmgeo.models.training.checkpoints import load_latest
-from lsmgeo.models.training.evaluating import evaluate_model
-from lsmgeo.models.training.feeding import Need, open_shapes, validation_batches
-from lsmgeo.models.training.launch import StopRequest
+from lsmgeo.models import Model, load
 from lsmgeo.models.weights import read_weights, write_weights
+from lsmgeo.training.batches import Need, open_shapes, validation_batches
+from lsmgeo.training.checkpoints import load_latest
+from lsmgeo.training.launch import StopRequest
+from lsmgeo.training.validation import evaluate_model
 
 __all__ = ["EVALUATION", "WEIGHTS", "Folder", "hash_shapes", "run_experiment"]
 

@@ -6,8 +6,8 @@ from lsmgeo.classical.filtering import guided_filter
 from lsmgeo.classical.matching import MatchingCosts, aggregate_views, matching_costs
 from lsmgeo.classical.plane_sweep import DepthMap, kept, sweep
 from lsmgeo.classical.planes import sweep_planes
-from lsmgeo.classical.reconstruct import Reconstruction, SceneReconstruction, reconstruct_scene, reconstruct_view
 from lsmgeo.classical.silhouettes import signed_distance, silhouettes
+from lsmgeo.classical.stereo import Reconstruction, SceneReconstruction, reconstruct_scene, reconstruct_view
 from lsmgeo.classical.surface import SurfaceMesh, drop_specks, extract_mesh, write_mesh
 from lsmgeo.classical.tsdf import Tsdf, fuse_depth
 from lsmgeo.classical.views import default_depth_range, select_neighbours

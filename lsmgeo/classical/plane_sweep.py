@@ -16,7 +16,7 @@ from lsmgeo.cameras import resize
 from lsmgeo.cameras.tensors import Cameras
 from lsmgeo.classical.matching import UNRELATED, aggregated_costs
 from lsmgeo.classical.planes import longest_path
-from lsmgeo.classical.winners import Winners
+from lsmgeo.classical.winner_take_all import Winners
 from lsmgeo.errors import OptionError
 
 __all__ = ["DepthMap", "kept", "slab_planes", "sweep"]

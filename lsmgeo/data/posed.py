@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from lsmgeo.cameras import CameraTensors
-    from lsmgeo.data.depth_files import DepthFile
-    from lsmgeo.data.lenses import Lens
+    from lsmgeo.data.formats.depth_files import DepthFile
+    from lsmgeo.data.formats.lenses import Lens
     from lsmgeo.grids import VoxelGrid
 
 __all__ = [

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from lsmgeo.data.calibration import CalibratedLens, Calibration
+    from lsmgeo.data.formats.calibration import CalibratedLens, Calibration
 
 __all__ = ["examine_calibration"]
 

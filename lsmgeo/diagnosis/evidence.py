@@ -7,11 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lsmgeo.diagnosis.findings import CENTRED, LIMITS, SIDES, Check, pixel_limit, share
-from lsmgeo.diagnosis.geometry import evenly
-from lsmgeo.diagnosis.matching import Matches, grey_picture, match_features
-from lsmgeo.diagnosis.residuals import in_front, reprojection_errors, sampson_distances
-from lsmgeo.diagnosis.silhouettes import (
+from lsmgeo.diagnosis.check_silhouettes import (
     epipolar_tangency,
     load_silhouettes,
     near_cells,
@@ -20,7 +16,7 @@ from lsmgeo.diagnosis.silhouettes import (
     overlap,
     within_a_cell,
 )
-from lsmgeo.diagnosis.surfaces import (
+from lsmgeo.diagnosis.check_surfaces import (
     Surfaces,
     load_surfaces,
     relative_errors,
@@ -28,6 +24,10 @@ from lsmgeo.diagnosis.surfaces import (
     thinned,
     warp_errors,
 )
+from lsmgeo.diagnosis.feature_matching import Matches, grey_picture, match_features
+from lsmgeo.diagnosis.findings import CENTRED, LIMITS, SIDES, Check, pixel_limit, share
+from lsmgeo.diagnosis.geometry import evenly
+from lsmgeo.diagnosis.residuals import in_front, reprojection_errors, sampson_distances
 
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.findings import CENTRED, SIDES, Check, badness
-from lsmgeo.diagnosis.mistakes import (
+from lsmgeo.diagnosis.camera_errors import (
     SCALES,
     Candidate,
     camera_mistakes,
@@ -18,7 +17,8 @@ from lsmgeo.diagnosis.mistakes import (
     resolution_mistakes,
     scaled,
 )
-from lsmgeo.diagnosis.orders import order_mistakes
+from lsmgeo.diagnosis.findings import CENTRED, SIDES, Check, badness
+from lsmgeo.diagnosis.permutations import order_mistakes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lsmgeo.diagnosis.check_surfaces import relative_errors
 from lsmgeo.diagnosis.evidence import DepthMaps, Features, Outlines, StereoPair, principal_offsets
+from lsmgeo.diagnosis.feature_matching import LEAST_VERIFIED, MAX_VIEWS, choose_views, count_features
 from lsmgeo.diagnosis.findings import LIMITS, Gap, counted
 from lsmgeo.diagnosis.geometry import evenly
-from lsmgeo.diagnosis.matching import LEAST_VERIFIED, MAX_VIEWS, choose_views, count_features
-from lsmgeo.diagnosis.surfaces import relative_errors
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

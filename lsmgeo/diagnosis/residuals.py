@@ -10,7 +10,7 @@ from lsmgeo.diagnosis.geometry import Geometry, fundamental, homogeneous, projec
 
 if TYPE_CHECKING:
     from lsmgeo.data import SparsePoints
-    from lsmgeo.diagnosis.matching import Matches
+    from lsmgeo.diagnosis.feature_matching import Matches
 
 __all__ = [
     "in_front", "pair_distances", "reprojection_errors", "reprojections", "residuals", "sampson_distances",

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lsmgeo._checks import check_choice, check_float
 from lsmgeo.errors import BackendError
-from lsmgeo.kernels import fused, reference
+from lsmgeo.kernels import reference, torch_ops
 from lsmgeo.kernels.request import OPERATORS, Options, Sites
 
 __all__ = ["BACKENDS", "OPERATORS", "Backend", "Options", "Sites", "check_backend", "explain", "run", "select"]
@@ -38,7 +38,7 @@ class Backend:
 
 # In the order in which "auto" tries them.
 BACKENDS: tuple[Backend, ...] = (
-    *(Backend(name, partial(fused.why_not, name), fused.operators(name)) for name in fused.KERNELS),
+    *(Backend(name, partial(torch_ops.why_not, name), torch_ops.operators(name)) for name in torch_ops.KERNELS),
     Backend("reference", reference.why_not, reference.OPERATORS),
 )
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from lsmgeo._dtypes import computing_dtype, saturating_cast
 from lsmgeo.kernels import reference
 from lsmgeo.kernels.request import Options
-from lsmgeo.kernels.statistics import view_statistics
+from lsmgeo.kernels.view_statistics import view_statistics
 
 __all__ = ["pixels_in_front", "project_points", "sample_pixels"]
 

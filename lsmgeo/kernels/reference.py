@@ -17,7 +17,7 @@ from lsmgeo._dtypes import computing_dtype, saturating_cast
 from lsmgeo.debugging import is_traced
 from lsmgeo.kernels.recompute import recomputed
 from lsmgeo.kernels.request import Options, Sites
-from lsmgeo.kernels.statistics import view_statistics
+from lsmgeo.kernels.view_statistics import view_statistics
 
 __all__ = ["OPERATORS", "why_not"]
 

@@ -4,8 +4,8 @@ from lsmgeo.scenes.backgrounds import background
 from lsmgeo.scenes.inside import occupancy, voxels
 from lsmgeo.scenes.lighting import Lights, shade
 from lsmgeo.scenes.meshing import to_mesh
+from lsmgeo.scenes.primitives import Kind, Material, Solid, box, cone, cylinder, ellipsoid, half_space, sphere
 from lsmgeo.scenes.rendering import Hits, Rendering, render, trace
-from lsmgeo.scenes.solids import Kind, Material, Solid, box, cone, cylinder, ellipsoid, half_space, sphere
 from lsmgeo.scenes.tables import Scene
 
 __all__ = [

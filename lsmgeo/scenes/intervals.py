@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from lsmgeo.scenes.solids import Kind
+from lsmgeo.scenes.primitives import Kind
 
 __all__ = ["interval"]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from lsmgeo._checks import is_whole
 from lsmgeo.errors import OptionError
-from lsmgeo.scenes.solids import Kind, Solid
+from lsmgeo.scenes.primitives import Kind, Solid
 from lsmgeo.scenes.tables import Scene, check_scenes
 
 if TYPE_CHECKING:

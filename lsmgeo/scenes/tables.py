@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lsmgeo.errors import OptionError, ShapeError
-from lsmgeo.scenes.solids import Kind, Material, Solid
+from lsmgeo.scenes.primitives import Kind, Material, Solid
 
 __all__ = ["Placed", "Scene", "Tables", "check_scenes", "layout"]
 

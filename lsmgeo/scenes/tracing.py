@@ -16,7 +16,7 @@ from torch import Tensor
 from lsmgeo._linalg import multiply, transform
 from lsmgeo.cameras.matrices import CameraMatrices
 from lsmgeo.scenes.intervals import interval
-from lsmgeo.scenes.solids import Kind
+from lsmgeo.scenes.primitives import Kind
 from lsmgeo.scenes.tables import Placed, Scene, Tables, layout
 
 __all__ = ["CameraRays", "FreeRays", "Plan", "first_hits", "make_plan"]

@@ -84,6 +84,6 @@ def test_cameras_in_one_place_tell_nothing(tmp_path):
 def test_a_given_end_beyond_the_found_range_falls_back_on_the_cameras(tmp_path, monkeypatch):
     scene, _ = write_photographs(tmp_path, (0.0, 0.0, 0.0))
     near, far = default_depth_range(scene, 0)
-    monkeypatch.setattr("lsmgeo.classical.reconstruct.find_depth_range", lambda *_, **__: (0.1 * near, 0.2 * near))
+    monkeypatch.setattr("lsmgeo.classical.stereo.find_depth_range", lambda *_, **__: (0.1 * near, 0.2 * near))
     one = reconstruct_view(scene, 0, near=near, planes=8, size=32)
     np.testing.assert_allclose([one.depths[0], one.depths[-1]], [near, far])

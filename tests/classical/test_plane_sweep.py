@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lsmgeo.classical import aggregate_views, matching_costs, sweep, sweep_planes
 from lsmgeo.classical.plane_sweep import slab_planes
-from lsmgeo.classical.winners import Winners
+from lsmgeo.classical.winner_take_all import Winners
 from lsmgeo.errors import GridError, OptionError, ShapeError
 from tests.classical import analytic
 from tests.classical.scored import cameras_of, errors, median_error, swept, within_one_plane

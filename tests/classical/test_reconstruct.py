@@ -61,7 +61,7 @@ def test_views_that_do_not_exist_are_named(read):
 
 
 def test_points_at_one_place_have_no_surface():
-    from lsmgeo.classical.reconstruct import surface_of
+    from lsmgeo.classical.stereo import surface_of
 
     assert len(surface_of([], np.ones((3, 3), np.float32), 16).faces) == 0
 

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from lsmgeo import cli
-from lsmgeo.demo import run_demo
-from tests.models.training.faults import in_child
+from lsmgeo.cli.demo_scene import run_demo
+from tests.training.faults import in_child
 
 
 def test_the_demo_recovers_the_depth_and_draws_it(tmp_path, capsys):
@@ -117,7 +117,7 @@ def test_the_installed_command_has_these_statuses_and_importing_it_is_light(tmp_
 
 
 def test_an_interrupted_demo_leaves_nothing(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("lsmgeo.demo.run_demo", interrupt)
+    monkeypatch.setattr("lsmgeo.cli.demo_scene.run_demo", interrupt)
     assert cli.main(["demo", "--out", str(tmp_path / "out")]) == 130
     assert capsys.readouterr().err == "lsmgeo: interrupted\n"
     assert list(tmp_path.iterdir()) == []

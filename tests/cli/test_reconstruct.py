@@ -258,9 +258,9 @@ def test_wrong_options_give_one_line_and_status_2(folder, tmp_path, capsys, argu
 @pytest.mark.parametrize(
     "place",
     [
-        "lsmgeo.classical.reconstruct.sweep",
-        "lsmgeo.classical.pictures.coloured_depth",
-        "lsmgeo.classical.pictures.summary",
+        "lsmgeo.classical.stereo.sweep",
+        "lsmgeo.reconstruct.result_figures.coloured_depth",
+        "lsmgeo.reconstruct.result_figures.summary",
         "os.fsync",
     ],
 )
@@ -282,7 +282,7 @@ def test_a_place_that_cannot_be_written_is_told_before_the_work(folder, tmp_path
     def work(*_, **__):
         raise AssertionError
 
-    monkeypatch.setattr("lsmgeo.classical.reconstruct.sweep", work)
+    monkeypatch.setattr("lsmgeo.classical.stereo.sweep", work)
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "out"):
         assert cli.main(["reconstruct", str(folder), "--out", str(out)]) == 2

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from lsmgeo.cameras import CameraTensors, select
-from lsmgeo.classical.outputs import Looked, Results
-from lsmgeo.classical.report_model import MOST_FACES, _thinned, make_viewer
-from lsmgeo.classical.report_page import make_page
 from lsmgeo.data import Mesh
+from lsmgeo.reconstruct.page import make_page
+from lsmgeo.reconstruct.viewer import MOST_FACES, _thinned, make_viewer
+from lsmgeo.reconstruct.write_results import Looked, Results
 from tests.cli.browser import Browser
 
 HOSTILE = "<script>document.title='taken'</script>\"'&{{ 7 * 7 }}.png"

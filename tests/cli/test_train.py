@@ -11,9 +11,9 @@ import pytest
 
 from lsmgeo import cli
 from lsmgeo.models import load
-from lsmgeo.models.training import loop
-from lsmgeo.models.training.checkpoints import load_latest
-from tests.models.training.runs import configure, write_shapes
+from lsmgeo.training import loop
+from lsmgeo.training.checkpoints import load_latest
+from tests.training.runs import configure, write_shapes
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from lsmgeo.models import load
 from lsmgeo.models.weights import write_weights
 from tests.compatibility.write_files import MODELS, output_of, shapes_of, what_they_hold
 from tests.data.shapes import SETTINGS
-from tests.models.training.runs import configure, losses, run
+from tests.training.runs import configure, losses, run
 
 FOLDERS = sorted(path for path in Path(__file__).parent.glob("version_*") if path.is_dir())
 

@@ -21,7 +21,7 @@ from lsmgeo.data import PosedImages, ShardSet, open_scene, write_cameras_json
 from lsmgeo.models import create, load
 from lsmgeo.models.weights import write_weights
 from tests.data.shapes import write_set
-from tests.models.training.runs import SIZES, configure, losses, run, write_shapes
+from tests.training.runs import SIZES, configure, losses, run, write_shapes
 
 MODELS = {
     "voxel-lsm": SIZES,

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from lsmgeo import cli, data
-from lsmgeo.data.convert_set import read_splits
+from lsmgeo.data.shards.convert_set import read_splits
 from lsmgeo.data.shards.shape_sources import split_by_name
 from lsmgeo.errors import DataError, OptionError
 from tests.data.hostile import TRIALS, judged, mutated

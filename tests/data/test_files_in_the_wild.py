@@ -10,10 +10,10 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from lsmgeo import data
-from lsmgeo.data import colmap
-from lsmgeo.data.depth_files import DepthPng
+from lsmgeo.data.formats import format_colmap
+from lsmgeo.data.formats.depth_files import DepthPng
+from lsmgeo.data.formats.lenses import Lens
 from lsmgeo.data.images import read_cut_out, read_image
-from lsmgeo.data.lenses import Lens
 from lsmgeo.errors import CameraError, DataError
 from tests.data import posed_writers
 from tests.data.hostile import TRIALS, mutated
@@ -193,7 +193,7 @@ def test_a_long_name_is_not_repeated_whole(tmp_path):
     write_colmap(make_scene(), tmp_path, form="text")
     (tmp_path / "sparse/0/images.txt").write_text(f"1 1 0 0 0 0 0 0 99 {'x' * 100_000}\n\n")
     with pytest.raises(DataError, match="refers to camera 99") as caught:
-        colmap.read_colmap(tmp_path)
+        format_colmap.read_colmap(tmp_path)
     assert len(str(caught.value)) < 1000
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from lsmgeo import data
-from lsmgeo.data import calibration
-from lsmgeo.data.calibration import read_storages
+from lsmgeo.data.formats import calibration
+from lsmgeo.data.formats.calibration import read_storages
 from lsmgeo.errors import DataError
 from tests.data.hostile import TRIALS, judged, mutated
 from tests.data.test_calibration import YAML, write_rig, write_storage

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lsmgeo import data
-from lsmgeo.data.depth_files import read_pfm
+from lsmgeo.data.formats.depth_files import read_pfm
 from tests.data.hostile import judge_mutations, read_scene, scene_refused
 from tests.data.test_rgbd import write_rgbd, write_seven_scenes
 from tests.data.test_stereo_pairs import HEIGHT, WIDTH, write_pair

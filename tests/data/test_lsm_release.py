@@ -11,8 +11,8 @@ import torch
 from scipy.io import savemat
 
 from lsmgeo import data
-from lsmgeo.data import lsm_release
-from lsmgeo.data.lsm_release import read_mats
+from lsmgeo.data.formats import format_lsm
+from lsmgeo.data.formats.format_lsm import read_mats
 from lsmgeo.errors import DataError, OptionError
 from tests.data.hostile import mutated
 from tests.data.release_writers import CENTRE, MODEL, RADIUS, SYNSET, ball_voxels, lsm_pose, write_lsm
@@ -183,7 +183,7 @@ VOLUMES = [
     (mat({"tsdf": np.zeros((32, 32, 32))}), "must hold Volume"),
     (mat({"Volume": np.zeros((300, 300, 300), bool)}, do_compression=True), "too large"),
     (bomb(), r"needs more than \d+ bytes of memory"),
-    (bytes(lsm_release.MAX_MAT_BYTES + 1), "larger than the limit"),
+    (bytes(format_lsm.MAX_MAT_BYTES + 1), "larger than the limit"),
 ]
 
 
@@ -263,7 +263,7 @@ def test_damaged_matlab_files_are_refused_or_read(tmp_path):
 
 @pytest.mark.parametrize("array", [np.array([np.nan]), np.array(["text"]), np.array([7], np.uint8)])
 def test_the_answer_of_a_process_is_checked(tmp_path, monkeypatch, array):
-    monkeypatch.setattr(lsm_release, "isolated", lambda *_, **__: [{"K": array}])
+    monkeypatch.setattr(format_lsm, "isolated", lambda *_, **__: [{"K": array}])
     (found,) = read_mats([tmp_path / "camera.mat"])
     assert isinstance(found, DataError)
     assert found.path == tmp_path / "camera.mat"

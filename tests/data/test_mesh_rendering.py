@@ -9,7 +9,7 @@ import trimesh
 
 from lsmgeo import cameras, scenes
 from lsmgeo.data import Mesh, from_trimesh, load_mesh, normalise, render_mesh
-from lsmgeo.data.mesh_rendering import EmbreeCaster, NumpyCaster
+from lsmgeo.data.meshes.mesh_rendering import EmbreeCaster, NumpyCaster
 from lsmgeo.errors import BackendError, CameraError, DTypeError, OptionError, ShapeError
 from tests.data.real_sets import folder_of_meshes
 from tests.tolerances import TERMWISE, length_error

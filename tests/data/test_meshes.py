@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 from lsmgeo.data import Mesh, from_trimesh, load_mesh, normalise
-from lsmgeo.data.mesh_topology import corner_normals
+from lsmgeo.data.meshes.mesh_topology import corner_normals
 from lsmgeo.errors import DataError, DTypeError, OptionError, ShapeError
 from tests.data import mesh_writers as writers
 from tests.data.real_sets import folder_of_meshes

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from lsmgeo import data
-from lsmgeo.data.depth_files import read_pfm
+from lsmgeo.data.formats.depth_files import read_pfm
 
 F, CX, CY, DOFFS, BASELINE = 50.5, 15.25, 11.5, 3.125, 193.001
 HEIGHT, WIDTH = 24, 32

@@ -3,7 +3,7 @@
 import pytest
 
 from lsmgeo.diagnosis import evidence
-from lsmgeo.diagnosis.matching import match_features
+from lsmgeo.diagnosis.feature_matching import match_features
 
 
 @pytest.fixture(scope="session")

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from lsmgeo.diagnosis import evidence, examine
+from lsmgeo.diagnosis.check_images import examine_photographs
+from lsmgeo.diagnosis.feature_matching import match_features
 from lsmgeo.diagnosis.geometry import as_they_are
-from lsmgeo.diagnosis.matching import match_features
-from lsmgeo.diagnosis.orders import order_mistakes
-from lsmgeo.diagnosis.photographs import examine_photographs
+from lsmgeo.diagnosis.permutations import order_mistakes
 from lsmgeo.errors import DataError
 from tests.diagnosis.textured import (
     in_order,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lsmgeo import data
-from lsmgeo.diagnosis.photographs import examine_photographs
+from lsmgeo.diagnosis.check_images import examine_photographs
 from tests.data.real_sets import real_set
 from tests.diagnosis.textured import planted
 

@@ -7,11 +7,13 @@ import pytest
 import torch
 
 from lsmgeo.data.posed import Observations, SparsePoints, Voxels
+from lsmgeo.diagnosis.check_silhouettes import Silhouettes, Solid, near_cells, overlap, within_a_cell
+from lsmgeo.diagnosis.check_surfaces import Surfaces, relative_errors, seen_errors
+from lsmgeo.diagnosis.feature_matching import Matches
 from lsmgeo.diagnosis.findings import Check, badness
 from lsmgeo.diagnosis.geometry import Geometry, Hypothesis
 from lsmgeo.diagnosis.half_pixel import find_shifts
-from lsmgeo.diagnosis.matching import Matches
-from lsmgeo.diagnosis.orders import assigned, named_orders, search_order
+from lsmgeo.diagnosis.permutations import assigned, named_orders, search_order
 from lsmgeo.diagnosis.residuals import (
     in_front,
     pair_distances,
@@ -20,8 +22,6 @@ from lsmgeo.diagnosis.residuals import (
     sampson_distances,
     view_costs,
 )
-from lsmgeo.diagnosis.silhouettes import Silhouettes, Solid, near_cells, overlap, within_a_cell
-from lsmgeo.diagnosis.surfaces import Surfaces, relative_errors, seen_errors
 from lsmgeo.grids import VoxelGrid
 
 RNG = np.random.default_rng(0)

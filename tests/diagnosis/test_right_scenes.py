@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lsmgeo.diagnosis.check_images import examine_photographs
 from lsmgeo.diagnosis.explain import is_decisive, is_suspicious
 from lsmgeo.diagnosis.findings import Check
 from lsmgeo.diagnosis.half_pixel import Shift, is_half_a_pixel, is_large, nearer_half
-from lsmgeo.diagnosis.photographs import examine_photographs
 from tests.diagnosis.textured import planted, trace, with_depth, write
 
 

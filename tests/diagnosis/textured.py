@@ -11,7 +11,7 @@ from PIL import Image
 
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.data import PosedImages
-from lsmgeo.data.depth_files import DepthFile
+from lsmgeo.data.formats.depth_files import DepthFile
 from lsmgeo.data.posed import Observations, SparsePoints, Voxels
 from lsmgeo.grids import VoxelGrid
 

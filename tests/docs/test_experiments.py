@@ -13,7 +13,7 @@ from benchmarks.experiments import collecting, queue, running
 from benchmarks.experiments.queue import Experiment
 from lsmgeo.data import Recipe
 from lsmgeo.models import load
-from tests.models.training.runs import end_of, stop_in
+from tests.training.runs import end_of, stop_in
 
 SET, SHAPES = Recipe(seed=0, views=2, size=32, voxels=(16,), depth=True), 65
 SMALL = {

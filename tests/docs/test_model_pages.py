@@ -10,10 +10,14 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import pytest
 
-from lsmgeo import cli, commands
+from lsmgeo.cli.convert_command import convert
+from lsmgeo.cli.evaluate_command import evaluate
+from lsmgeo.cli.reconstruct_command import reconstruct
+from lsmgeo.cli.render_command import render
+from lsmgeo.cli.train_command import train
+from lsmgeo.evaluation import REPORTS
 from lsmgeo.models import create
-from lsmgeo.models.evaluation import REPORTS
-from lsmgeo.models.training.config import GROUPS, read_config
+from lsmgeo.training.config import GROUPS, read_config
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -21,8 +25,8 @@ GUIDES = {name: (DOCS / f"{name}.rst").read_text(encoding="utf-8") for name in (
 PAGES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((DOCS / "models").glob("*.rst"))}
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = {
-    "train": commands.train, "evaluate": commands.evaluate, "reconstruct": commands.reconstruct, "render": cli.render,
-    "convert": cli.convert,
+    "train": train, "evaluate": evaluate, "reconstruct": reconstruct, "render": render,
+    "convert": convert,
 }  # fmt: skip
 
 

@@ -5,13 +5,14 @@ import re
 import textwrap
 from pathlib import Path
 
-from lsmgeo import classical, commands
+from lsmgeo import classical
+from lsmgeo.cli.reconstruct_command import reconstruct
 from lsmgeo.metrics import depth_errors
 
 ROOT = Path(__file__).resolve().parents[2]
 GUIDE = (ROOT / "docs" / "reconstruct.rst").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-OPTIONS = inspect.signature(commands.reconstruct).parameters
+OPTIONS = inspect.signature(reconstruct).parameters
 
 
 def default(function, name: str):

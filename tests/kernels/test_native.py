@@ -15,36 +15,37 @@ from hypothesis import strategies as st
 from lsmgeo import functional, rays
 from lsmgeo._sites import image_sites, sweep_sites
 from lsmgeo.errors import BackendError
-from lsmgeo.kernels import Options, cpu, explain
+from lsmgeo.kernels import Options, explain
+from lsmgeo.kernels.native import library
 from tests.kernels import cases
 from tests.kernels.comparison import Call, compare, sweep_call, unproject_call
 from tests.property import support
 from tests.strategies import Scene, scenes, sweep_depths
 from tests.tolerances import UNIT_ROUNDOFF
 
-REASON = cpu.why_not("unproject", torch.zeros(1), Options("bilinear"))
+REASON = library.why_not("unproject", torch.zeros(1), Options("bilinear"))
 pytestmark = pytest.mark.skipif(REASON is not None, reason=f"the C++ kernels: {REASON}")
 
 
 def instruction_sets() -> list[str]:
     found = []
     if REASON is None:
-        best = cpu.instruction_set()
+        best = library.instruction_set()
         for name in ("baseline", "avx2", "avx512"):
             try:
-                found.append(cpu.instruction_set(name))
+                found.append(library.instruction_set(name))
             except ValueError:
                 continue
-        cpu.instruction_set(best)
+        library.instruction_set(best)
     return found
 
 
 @pytest.fixture(params=instruction_sets() or ["none"])
 def instruction_set(request):
-    before = cpu.instruction_set()
-    cpu.instruction_set(request.param)
+    before = library.instruction_set()
+    library.instruction_set(request.param)
     yield request.param
-    cpu.instruction_set(before)
+    library.instruction_set(before)
 
 
 @pytest.mark.parametrize("name", {**cases.CASES, **cases.HALF})
@@ -175,15 +176,15 @@ def test_the_same_bits_from_run_to_run(operator, threads):
 def test_memory_that_is_given_is_written_to():
     options = Options.checked("test", "bilinear")
     sites = image_sites("test", cases.WIDE, cases.VIEWS, cases.GRID, None, options)
-    expected, _ = cpu.images(cases.WIDE, sites, options)
+    expected, _ = library.images(cases.WIDE, sites, options)
     out = torch.full(expected.shape, torch.nan)  # contiguous, unlike what the kernel would make
-    found, _ = cpu.images(cases.WIDE, sites, options, out)
+    found, _ = library.images(cases.WIDE, sites, options, out)
     assert found is out
     torch.testing.assert_close(out, expected, rtol=0, atol=0)
     needs = (True, False, False, False)
-    gradient, *_ = cpu.images_backward(expected, cases.WIDE, sites, options, needs)
+    gradient, *_ = library.images_backward(expected, cases.WIDE, sites, options, needs)
     into = torch.ones_like(gradient)
-    cpu.images_backward(expected, cases.WIDE, sites, options, needs, into)
+    library.images_backward(expected, cases.WIDE, sites, options, needs, into)
     torch.testing.assert_close(into, gradient + 1.0)
 
 
@@ -191,9 +192,9 @@ def test_half_volumes_swept_into_float32():
     options = Options.checked("test", "trilinear")
     volume = cases.VOLUME.bfloat16()
     sites = sweep_sites("test", volume, cases.VIEWS, cases.GRID, cases.DEPTHS, cases.SIZE, None, options)
-    expected, _ = cpu.volume(volume.float(), sites, options)
+    expected, _ = library.volume(volume.float(), sites, options)
     out = torch.empty(expected.shape)
-    cpu.volume(volume, sites, options, out)
+    library.volume(volume, sites, options, out)
     torch.testing.assert_close(out, expected, rtol=1e-6, atol=1e-6)
 
 
@@ -382,7 +383,7 @@ def test_it_can_be_turned_off():
     code = (
         "import torch; from lsmgeo import kernels;"
         "kernels.explain('unproject', torch.zeros(1, 2, 3, 4, 5));"
-        "print(kernels.cpu.fresh((2, 3), torch.float32).shape)"
+        "print(kernels.native.library.fresh((2, 3), torch.float32).shape)"
     )
     text = _child(code, LSMGEO_NATIVE="0")
     assert "cpu: turned off by LSMGEO_NATIVE=0" in text
@@ -393,13 +394,13 @@ def test_it_can_be_turned_off():
 def test_a_file_that_is_no_library_is_a_reason(tmp_path: Path):
     broken = tmp_path / "_native.abi3.so"
     broken.write_bytes(b"not a library")
-    reason = cpu.load(broken)
+    reason = library.load(broken)
     assert isinstance(reason, str)
     assert "_native.abi3.so does not load" in reason
 
 
 def test_another_library_is_a_reason():
-    reason = cpu.load(Path(torch.__file__).parent / "lib" / "libtorch_global_deps.so")
+    reason = library.load(Path(torch.__file__).parent / "lib" / "libtorch_global_deps.so")
     assert isinstance(reason, str)
 
 

@@ -8,7 +8,7 @@ import os
 import pytest
 import torch
 
-from lsmgeo.kernels import cpu
+from lsmgeo.kernels.native import library as native
 from tests.kernels.cases import CASES, HALF
 from tests.kernels.native_faults import FAULTS, build, commit, compiler
 
@@ -20,14 +20,14 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
-    loaded = cpu.load(build(tmp_path_factory.mktemp("faults")))
+    loaded = native.load(build(tmp_path_factory.mktemp("faults")))
     assert isinstance(loaded, ctypes.CDLL), loaded
     return loaded
 
 
 def _noticed(monkeypatch, library, fault: str | None) -> list[str]:
     commit(library, fault)
-    monkeypatch.setattr(cpu, "_library", lambda: library)
+    monkeypatch.setattr(native, "_library", lambda: library)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)  # so that channels are split in chunks
     found = []
     for name, case in {**CASES, **HALF}.items():

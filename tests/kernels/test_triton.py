@@ -8,7 +8,8 @@ import sys
 import pytest
 import torch
 
-from lsmgeo.kernels import OPERATORS, Options, gpu
+from lsmgeo.kernels import OPERATORS, Options
+from lsmgeo.kernels.triton import operators
 from tests.kernels.triton_cases import CASES
 from tests.kernels.triton_faults import FAULTS
 from tests.kernels.triton_runner import outcomes
@@ -54,20 +55,20 @@ class TestReasons:
     @needs_triton
     def test_no_gpu(self, operator, monkeypatch):
         monkeypatch.delenv("TRITON_INTERPRET", raising=False)
-        assert "CUDA tensors, these are on cpu" in gpu.why_not(operator, FEATURES, OPTIONS)
+        assert "CUDA tensors, these are on cpu" in operators.why_not(operator, FEATURES, OPTIONS)
 
     @needs_triton
     def test_the_interpreter_runs_cpu_tensors(self, operator, monkeypatch):
         monkeypatch.setenv("TRITON_INTERPRET", "1")
-        assert gpu.why_not(operator, FEATURES, OPTIONS) is None
-        assert gpu.why_not(operator, FEATURES.half(), OPTIONS) is None
-        assert "these are on meta" in gpu.why_not(operator, FEATURES.to("meta"), OPTIONS)
+        assert operators.why_not(operator, FEATURES, OPTIONS) is None
+        assert operators.why_not(operator, FEATURES.half(), OPTIONS) is None
+        assert "these are on meta" in operators.why_not(operator, FEATURES.to("meta"), OPTIONS)
 
     def test_float64(self, operator, monkeypatch):
         monkeypatch.setenv("TRITON_INTERPRET", "1")
-        assert gpu.why_not(operator, FEATURES.double(), OPTIONS) == "float64 stays on the reference path"
+        assert operators.why_not(operator, FEATURES.double(), OPTIONS) == "float64 stays on the reference path"
 
     def test_no_triton(self, operator, monkeypatch):
         monkeypatch.setenv("TRITON_INTERPRET", "1")
         monkeypatch.setitem(sys.modules, "triton", None)
-        assert gpu.why_not(operator, FEATURES, OPTIONS) == "Triton is not installed"
+        assert operators.why_not(operator, FEATURES, OPTIONS) == "Triton is not installed"

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import pytest
 import torch
 
-from lsmgeo.kernels import Options, Sites, gpu_launch
+from lsmgeo.kernels import Options, Sites
+from lsmgeo.kernels.triton import launcher
 from tests.kernels.triton_support import Points, by_kernels, deterministic
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
@@ -57,7 +58,7 @@ def compiled(monkeypatch, tmp_path, variant):
         found.append(run(self, *args, grid=grid, warmup=True, **kwargs))
 
     if variant in VARIANTS:
-        monkeypatch.setattr(gpu_launch, "TILE", 512)  # a quarter of the code
+        monkeypatch.setattr(launcher, "TILE", 512)  # a quarter of the code
     before = triton.runtime.driver._active
     monkeypatch.setattr(JITFunction, "run", compile_only)
     triton.runtime.driver.set_active(Hopper())

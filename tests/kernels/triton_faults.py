@@ -17,12 +17,12 @@ from typing import NamedTuple
 
 import torch
 
-from lsmgeo.kernels import gpu, gpu_launch, gpu_tables
 from lsmgeo.kernels.request import Options
+from lsmgeo.kernels.triton import launch_tables, launcher, operators
 from tests.kernels.triton_support import compare, compare_sweep, features, image_sites, sweep_sites, volumes
 
-FOLDER = Path(gpu.__file__).parent
-KERNELS, GRADIENTS, TABLES = "gpu_kernels", "gpu_gradients", "gpu_tables"
+FOLDER = Path(operators.__file__).parent
+KERNELS, GRADIENTS, TABLES = "forward", "backward", "launch_tables"
 COUNT = itertools.count()
 
 
@@ -136,28 +136,28 @@ def broken(fault: Fault | None) -> Iterator[None]:
         texts[fault.file] = texts[fault.file].replace(fault.text, fault.instead)
     names = {name: f"{name}_{next(COUNT)}" for name in texts}
     texts[GRADIENTS] = texts[GRADIENTS].replace(f"lsmgeo.kernels.{KERNELS}", names[KERNELS])
-    before = gpu_launch.kernels, gpu.tables, gpu.lattice_gradients
+    before = launcher.kernels, operators.tables, operators.lattice_gradients
     with tempfile.TemporaryDirectory() as folder:
         kernels, gradients, tables = (_load(names[name], texts[name], Path(folder)) for name in texts)
         found = {"resample": kernels.resample, "resample_backward": gradients.resample_backward}
-        gpu_launch.kernels = lambda: found
-        gpu.tables, gpu.lattice_gradients = tables.tables, tables.lattice_gradients
+        launcher.kernels = lambda: found
+        operators.tables, operators.lattice_gradients = tables.tables, tables.lattice_gradients
         try:
             yield
         finally:
-            gpu_launch.kernels, gpu.tables, gpu.lattice_gradients = before
+            launcher.kernels, operators.tables, operators.lattice_gradients = before
             for name in names.values():
                 sys.modules.pop(name)
 
 
 def _sound() -> None:
     """Without a fault every comparison passes."""
-    assert gpu.tables is gpu_tables.tables
+    assert operators.tables is launch_tables.tables
     with broken(None):
-        assert gpu.tables is not gpu_tables.tables
+        assert operators.tables is not launch_tables.tables
         for comparison in COMPARISONS.values():
             comparison()
-    assert gpu.tables is gpu_tables.tables
+    assert operators.tables is launch_tables.tables
 
 
 def _noticed(fault: Fault) -> Callable[[], None]:

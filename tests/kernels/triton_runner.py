@@ -19,7 +19,8 @@ from typing import NamedTuple
 
 import torch
 
-from lsmgeo.kernels import Options, gpu
+from lsmgeo.kernels import Options
+from lsmgeo.kernels.triton import operators
 
 
 class Outcome(NamedTuple):
@@ -84,7 +85,7 @@ def main() -> None:
         from tests.kernels.triton_cases import CASES as chosen
     else:
         from tests.kernels.triton_faults import FAULTS as chosen
-    assert gpu.why_not("unproject", torch.zeros(1, 1, 1, 2, 2), Options("bilinear")) is None
+    assert operators.why_not("unproject", torch.zeros(1, 1, 1, 2, 2), Options("bilinear")) is None
     assert "triton" not in sys.modules, "Triton is imported before the first launch"
     patch_once()
     run(chosen, names or chosen)

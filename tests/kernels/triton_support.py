@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from lsmgeo._dtypes import computing_dtype, saturating_cast
-from lsmgeo.kernels import gpu, reference
+from lsmgeo.kernels import reference
 from lsmgeo.kernels.request import Options, Sites
-from lsmgeo.kernels.statistics import view_statistics
+from lsmgeo.kernels.triton import operators
+from lsmgeo.kernels.view_statistics import view_statistics
 from tests.kernels.comparison import assert_as_exact
 
 B, V = 1, 3  # scenes and views where a case says nothing else
@@ -140,7 +141,7 @@ def points(seed: int = 3, extras: int = 2, count: int = 11) -> Points:
 
 
 def sample_pixels(source: Tensor, given: Points, options: Options) -> tuple[Tensor, Tensor]:
-    """What `gpu.pixels` means, by the reference's parts."""
+    """What `operators.pixels` means, by the reference's parts."""
     dtype, output = computing_dtype(source), source.dtype
     index = [torch.where(given.front, axis, -2.0) for axis in given.pixels.to(dtype).unbind(-1)]
     values, visible = reference._sample(source.to(dtype), index, given.front, options)
@@ -184,11 +185,13 @@ def by_kernels(
     """The kernels' answer and gradients; the cotangent is the answer itself if None."""
     needs = (True,) * 4
     if not isinstance(place, Sites):
-        values, visible = gpu.pixels(source, *place, options)
-        back = gpu.pixels_backward(values if cotangent is None else cotangent, source, *place, options, needs[:3])
+        values, visible = operators.pixels(source, *place, options)
+        back = operators.pixels_backward(values if cotangent is None else cotangent, source, *place, options, needs[:3])
         return values, visible, list(back)
-    values, visible = gpu.volume(source, place, options, out) if volume else gpu.images(source, place, options)
-    backward = gpu.volume_backward if volume else gpu.images_backward
+    values, visible = (
+        operators.volume(source, place, options, out) if volume else operators.images(source, place, options)
+    )
+    backward = operators.volume_backward if volume else operators.images_backward
     return values, visible, list(backward(values if cotangent is None else cotangent, source, place, options, needs))
 
 

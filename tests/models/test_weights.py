@@ -18,9 +18,9 @@ import torch
 
 from lsmgeo.errors import CheckpointError, DTypeError, OptionError
 from lsmgeo.models import create, load, settings_of, weights, write_weights
-from lsmgeo.models.training.checkpoints import save_checkpoint
 from lsmgeo.models.weights import read_weights
-from tests.models.training.faults import in_child
+from lsmgeo.training.checkpoints import save_checkpoint
+from tests.training.faults import in_child
 
 NAMES = ("voxel-lsm", "depth-lsm", "r2n2", "r2n2-pose")
 

@@ -9,7 +9,8 @@ from lsmgeo import functional, grids, rays
 from lsmgeo._linalg import transform
 from lsmgeo._sites import direction_matrix
 from lsmgeo.cameras import matrices, transforms
-from lsmgeo.kernels import reference, request, statistics
+from lsmgeo.kernels import reference, request
+from lsmgeo.kernels import view_statistics as statistics
 from tests.mutants import patching
 from tests.mutants.patching import (
     around,

@@ -37,21 +37,25 @@ MAY_IMPORT = {
     "fusion": SHARED | {"functional", "kernels"},
     "rays": SHARED | {"functional", "grids", "kernels", "_sites"},
 }
-OUTSIDE_THE_CORE = {
-    "models", "data", "classical", "scenes", "metrics", "cli", "commands", "demo", "diagnosis", "drawing",
-}  # fmt: skip
 # What the parts outside may import of each other; the core is open to all of them.
 MAY_ALSO_IMPORT = {
     "scenes": set(),
-    "data": {"scenes"},
     "metrics": set(),
+    "data": {"scenes"},
     "drawing": {"data"},
     "diagnosis": {"data", "drawing"},
     "classical": {"data", "scenes", "drawing"},
-    "models": {"data", "scenes", "metrics", "drawing", "classical"},
-    "demo": {"data", "scenes", "drawing", "classical"},
-}
-NETWORKS = {"blocks", "creating", "depth_lsm", "losses", "outputs", "r2n2", "settings", "voxel_lsm"}
+    "models": {"data", "scenes", "metrics"},
+    "training": {"models", "data", "scenes", "metrics", "drawing"},
+    "evaluation": {"models", "training", "classical", "data", "scenes", "metrics", "drawing"},
+    "reconstruct": {"models", "classical", "data", "scenes", "drawing"},
+    "cli": {
+        "training", "evaluation", "reconstruct", "diagnosis", "models", "classical", "data", "scenes", "drawing",
+    },
+}  # fmt: skip
+OUTSIDE_THE_CORE = set(MAY_ALSO_IMPORT)
+# The old places of `lsmgeo.training` and `lsmgeo.evaluation`, for this version.
+OLD_PLACES = {"lsmgeo.models.training", "lsmgeo.models.evaluation"}
 HEAVY = {"cv2", "trimesh", "skimage", "matplotlib", "jsonargparse", "triton", "scipy", "tqdm", "PIL"}
 
 
@@ -96,24 +100,47 @@ def test_every_module_has_its_place():
 def test_the_core_imports_along_the_arrows(module):
     names = imported(MODULES[module], module)
     assert violations(module, names) == set()
-    allowed = {"triton"} if module.startswith("lsmgeo.kernels.gpu_") else set()  # loaded with the first call
+    allowed = {"triton"} if module.startswith("lsmgeo.kernels.triton.") else set()  # loaded with the first call
     assert {name.split(".")[0] for name in names} & HEAVY <= allowed
 
 
-@pytest.mark.parametrize("module", [module for module in MODULES if part(module) in MAY_ALSO_IMPORT])
+@pytest.mark.parametrize(
+    "module", sorted(module for module in set(MODULES) - OLD_PLACES if part(module) in MAY_ALSO_IMPORT)
+)
 def test_what_is_outside_the_core_imports_along_its_arrows(module):
     own = {part(name) for name in imported(MODULES[module], module) if name.split(".")[0] == "lsmgeo"}
     assert own & OUTSIDE_THE_CORE <= MAY_ALSO_IMPORT[part(module)] | {part(module)}
 
 
-def test_the_networks_know_nothing_of_training():
+def test_the_networks_need_no_trainer():
     """Who has the networks alone needs neither accelerate nor the trainer."""
-    above = ("accelerate", "tensorboard", "lsmgeo.models.training", "lsmgeo.models.evaluation")
-    for module in (f"lsmgeo.models.{name}" for name in NETWORKS):
-        assert not any(name.startswith(above) for name in imported(MODULES[module], module)), module
+    for module in set(MODULES) - OLD_PLACES:
+        if part(module) == "models":
+            assert {name.split(".")[0] for name in imported(MODULES[module], module)} & {
+                "accelerate",
+                "tensorboard",
+            } == set()
 
 
-PACKAGES = ("lsmgeo.scenes", "lsmgeo.scenes.synthetic13", "lsmgeo.data", "lsmgeo.metrics", "lsmgeo.models")
+@pytest.mark.parametrize("name", ["training", "evaluation"])
+def test_old_places_name_the_new_ones(name):
+    old = importlib.import_module(f"lsmgeo.models.{name}")
+    new = importlib.import_module(f"lsmgeo.{name}")
+    with pytest.warns(DeprecationWarning, match=f"lsmgeo.models.{name} is now lsmgeo.{name}"):
+        assert all(getattr(old, public) is getattr(new, public) for public in new.__all__)
+    with pytest.warns(DeprecationWarning, match="is now"), pytest.raises(AttributeError):
+        old.nothing  # noqa: B018
+
+
+PACKAGES = (
+    "lsmgeo.scenes",
+    "lsmgeo.scenes.synthetic13",
+    "lsmgeo.data",
+    "lsmgeo.metrics",
+    "lsmgeo.models",
+    "lsmgeo.training",
+    "lsmgeo.evaluation",
+)
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -292,3 +319,18 @@ def test_every_exported_name_exists(module):
     loaded = importlib.import_module(module)
     for name in getattr(loaded, "__all__", []):
         assert hasattr(loaded, name), name
+
+
+def test_names_of_files_are_unique():
+    """A reader who is told a file's name finds one; an old place holds nothing."""
+    names: dict[str, list[str]] = {}
+    for module, path in MODULES.items():
+        if path.name != "__init__.py" and module not in OLD_PLACES:
+            names.setdefault(path.name, []).append(module)
+    assert {name: modules for name, modules in names.items() if len(modules) > 1} == {}
+
+
+def test_folders_are_small():
+    folders = {path for path in PACKAGE.rglob("*") if path.is_dir() and path.name != "__pycache__"}
+    crowded = {folder.name for folder in folders if sum(path.suffix != ".so" for path in folder.iterdir()) > 26}
+    assert crowded == set()

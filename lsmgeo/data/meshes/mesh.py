@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lsmgeo._checks import LARGEST_COUNT, check_choice, describe
-from lsmgeo.data.mesh_topology import is_watertight
+from lsmgeo.data.meshes.mesh_topology import is_watertight
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
 
 if TYPE_CHECKING:

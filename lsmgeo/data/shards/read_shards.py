@@ -12,13 +12,13 @@ import numpy as np
 import torch
 
 from lsmgeo._checks import check_flag, describe, is_whole
-from lsmgeo.data.backgrounds import Background, BackgroundError, make_background
 from lsmgeo.data.files import child
 from lsmgeo.data.images import DEPTH, RGBA, PngKind, decode_png
-from lsmgeo.data.members import decode_occupancy
-from lsmgeo.data.metadata import Metadata, decode_metadata
 from lsmgeo.data.sample import Sample
+from lsmgeo.data.shards.background_sources import Background, BackgroundError, make_background
 from lsmgeo.data.shards.shard_index import ShardFile, ShardIndex, read_index
+from lsmgeo.data.shards.shard_members import decode_occupancy
+from lsmgeo.data.shards.shard_metadata import Metadata, decode_metadata
 from lsmgeo.errors import DataError, OptionError
 
 __all__ = ["ShardSet"]

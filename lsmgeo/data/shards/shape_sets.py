@@ -15,8 +15,8 @@ from torch import Tensor
 from lsmgeo import scenes
 from lsmgeo._checks import check_choice
 from lsmgeo.cameras import CameraTensors, to
-from lsmgeo.data.backgrounds import Background, make_background
 from lsmgeo.data.sample import Batch, Sample, collate, pad_with_first, pad_with_zeros
+from lsmgeo.data.shards.background_sources import Background, make_background
 from lsmgeo.data.shards.read_shards import ShardSet
 from lsmgeo.errors import OptionError
 from lsmgeo.scenes import Lights, synthetic13

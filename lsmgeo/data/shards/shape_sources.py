@@ -16,9 +16,9 @@ from torch import Tensor
 
 from lsmgeo import scenes
 from lsmgeo._checks import check_whole
-from lsmgeo.data.metadata import is_text
 from lsmgeo.data.sample import Sample
 from lsmgeo.data.shards.shape_sets import describe_shape, render_shapes
+from lsmgeo.data.shards.shard_metadata import is_text
 from lsmgeo.errors import DataError, LsmGeoError, OptionError
 from lsmgeo.scenes import synthetic13
 
@@ -188,9 +188,9 @@ class MeshFolder(FileSource):
         return [path, *(sorted(path.parent.glob("*.mtl")) if path.suffix.lower() == ".obj" else [])]
 
     def _render(self, index: int, recipe: Recipe) -> Rendered:
-        from lsmgeo.data.mesh_rendering import render_mesh
         from lsmgeo.data.meshes import load_mesh, normalise
-        from lsmgeo.data.voxelise import voxelise
+        from lsmgeo.data.meshes.mesh_rendering import render_mesh
+        from lsmgeo.data.meshes.voxelise import voxelise
 
         file = self.paths[index - self.first]
         mesh = normalise(load_mesh(self.root / file))

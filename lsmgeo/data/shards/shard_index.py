@@ -22,8 +22,8 @@ import numpy as np
 
 from lsmgeo._checks import describe
 from lsmgeo.data.files import read_bytes
-from lsmgeo.data.members import KEY, SUFFIX
-from lsmgeo.data.metadata import decode_texts, is_text
+from lsmgeo.data.shards.shard_members import KEY, SUFFIX
+from lsmgeo.data.shards.shard_metadata import decode_texts, is_text
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:

@@ -17,8 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 from lsmgeo._checks import describe
 from lsmgeo.data.files import atomic_file, write_atomic
-from lsmgeo.data.members import SUFFIX, format_key
-from lsmgeo.data.metadata import decode_metadata
 from lsmgeo.data.shards.shard_index import (
     BLOCK,
     MAX_MEMBER_BYTES,
@@ -29,6 +27,8 @@ from lsmgeo.data.shards.shard_index import (
     seal,
     sidecar_path,
 )
+from lsmgeo.data.shards.shard_members import SUFFIX, format_key
+from lsmgeo.data.shards.shard_metadata import decode_metadata
 from lsmgeo.errors import DataError, OptionError
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ engines), a tail (conventional, T, V, fin, twin fins) and a landing gear (none, 
 
 from __future__ import annotations
 
-from lsmgeo.scenes.solids import Solid, box, cone, cylinder, ellipsoid
+from lsmgeo.scenes.primitives import Solid, box, cone, cylinder, ellipsoid
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
 from lsmgeo.scenes.synthetic13.parts import Pair, Point, bar, block, pair, rod, slab, wheel, wing
 

@@ -7,7 +7,7 @@ middle).
 
 from __future__ import annotations
 
-from lsmgeo.scenes.solids import Solid, box, ellipsoid
+from lsmgeo.scenes.primitives import Solid, box, ellipsoid
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
 from lsmgeo.scenes.synthetic13.parts import Point, bar, block, pair, rack, slab, spaced, window
 

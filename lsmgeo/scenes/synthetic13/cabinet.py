@@ -7,7 +7,7 @@ where shelves are, a back (closed, open).
 
 from __future__ import annotations
 
-from lsmgeo.scenes.solids import Solid, box, sphere
+from lsmgeo.scenes.primitives import Solid, box, sphere
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
 from lsmgeo.scenes.synthetic13.parts import Point, bar, block, pair, slab, spaced
 

@@ -7,7 +7,7 @@ wheel, spoiler).
 
 from __future__ import annotations
 
-from lsmgeo.scenes.solids import Solid, box, ellipsoid, sphere
+from lsmgeo.scenes.primitives import Solid, box, ellipsoid, sphere
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
 from lsmgeo.scenes.synthetic13.parts import Pair, bar, below, block, kept, pair, rod, slab, wheel
 

@@ -6,7 +6,7 @@ cushioned), a back (solid, vertical slats, horizontal slats, round, frame, none)
 
 from __future__ import annotations
 
-from lsmgeo.scenes.solids import Solid, box, ellipsoid
+from lsmgeo.scenes.primitives import Solid, box, ellipsoid
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
 from lsmgeo.scenes.synthetic13.parts import bar, block, pair, pillar, rack, rod, slab, spokes, window
 

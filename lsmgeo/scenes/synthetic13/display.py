@@ -7,7 +7,7 @@ tube: swivel, feet, none).
 
 from __future__ import annotations
 
-from lsmgeo.scenes.solids import Solid, box, cylinder
+from lsmgeo.scenes.primitives import Solid, box, cylinder
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
 from lsmgeo.scenes.synthetic13.parts import bar, below, block, kept, pair, pillar, rack, rod, slab, spokes
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lsmgeo.errors import OptionError
-from lsmgeo.scenes.solids import Material
+from lsmgeo.scenes.primitives import Material
 
 __all__ = ["Palette", "Parameters", "random_palette"]
 

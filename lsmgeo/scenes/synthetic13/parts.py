@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from lsmgeo.scenes.solids import Kind, Material, Solid, box, cone, cylinder, half_space
+from lsmgeo.scenes.primitives import Kind, Material, Solid, box, cone, cylinder, half_space
 
 __all__ = [
     "Pair",

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from lsmgeo.scenes.solids import Solid, box, cone, cylinder, ellipsoid
+from lsmgeo.scenes.primitives import Solid, box, cone, cylinder, ellipsoid
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
 from lsmgeo.scenes.synthetic13.parts import bar, below, block, pair, pillar, rack, ring, rod, slab
 

@@ -17,7 +17,7 @@ from lsmgeo._checks import check_size, check_whole
 from lsmgeo.cameras import CameraTensors, orbit
 from lsmgeo.errors import OptionError
 from lsmgeo.scenes.lighting import Lights
-from lsmgeo.scenes.solids import Kind, Solid
+from lsmgeo.scenes.primitives import Kind, Solid
 from lsmgeo.scenes.synthetic13.parameters import Parameters, random_palette
 from lsmgeo.scenes.tables import Scene
 

@@ -7,7 +7,7 @@ without a back.
 
 from __future__ import annotations
 
-from lsmgeo.scenes.solids import Solid, box, cylinder, ellipsoid
+from lsmgeo.scenes.primitives import Solid, box, cylinder, ellipsoid
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
 from lsmgeo.scenes.synthetic13.parts import Pair, Point, bar, below, block, pair, pillar, rod, slab, spaced, window
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lsmgeo.scenes.solids import Solid, box, cone, cylinder, ellipsoid, half_space, sphere
+from lsmgeo.scenes.primitives import Solid, box, cone, cylinder, ellipsoid, half_space, sphere
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
 from lsmgeo.scenes.synthetic13.parts import (
     Point,

@@ -7,7 +7,7 @@ what is below the top (nothing, apron, shelf, drawer, stretcher), a taper.
 
 from __future__ import annotations
 
-from lsmgeo.scenes.solids import Solid, box, cone, half_space, sphere
+from lsmgeo.scenes.primitives import Solid, box, cone, half_space, sphere
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
 from lsmgeo.scenes.synthetic13.parts import bar, block, pair, pillar, slab, spokes, window
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lsmgeo.scenes.solids import Solid, box, cylinder, ellipsoid
+from lsmgeo.scenes.primitives import Solid, box, cylinder, ellipsoid
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
 from lsmgeo.scenes.synthetic13.parts import Pair, below, block, pair, pillar, ring, rod, slab, spaced
 

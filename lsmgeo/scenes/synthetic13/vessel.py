@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lsmgeo.scenes.solids import Solid, box, cone, cylinder, ellipsoid, half_space
+from lsmgeo.scenes.primitives import Solid, box, cone, cylinder, ellipsoid, half_space
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
 from lsmgeo.scenes.synthetic13.parts import bar, below, block, kept, pair, pillar, ring, rod, slab, spaced, wing
 

@@ -1,0 +1,1 @@
+"""One file a format: what it holds is read, checked and given as one typed scene."""

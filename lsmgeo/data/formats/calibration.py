@@ -1,0 +1,296 @@
+"""Calibrations as OpenCV's samples write them: lenses, rigs of two cameras, and the boards that were seen."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+from lsmgeo.data.files import child, refuse_unreadable
+from lsmgeo.data.formats.lenses import Lens
+from lsmgeo.data.formats.opencv_storage import is_storage, parse_storage
+from lsmgeo.data.images import SUFFIXES
+from lsmgeo.data.isolated import isolated
+from lsmgeo.data.posed import MAX_SIDE, check_intrinsics, check_rotation
+from lsmgeo.errors import DataError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+__all__ = ["Board", "CalibratedLens", "Calibration", "Rig", "calibration_files", "is_calibration", "read_calibration"]
+
+MOST_FILES = 64
+# A calibration with the corners of a hundred boards in it has one tenth of this.
+MAX_STORAGE_BYTES = 1 << 22
+# Of address space; OpenCV and NumPy take most of it.
+MEMORY = 1 << 30
+SECONDS = 30.0
+BEYOND = 1e12
+MOST_COEFFICIENT = 1e6
+MOST_CORNERS = 100
+COUNTS = {"perspective": (4, 5, 8, 12, 14), "fisheye": (4,)}
+# Names are compared without underscores and capitals, in which the samples of several years differ.
+MATRICES = ("cameramatrix", "intrinsicmatrix", "m", "k")
+DISTORTIONS = ("distortioncoefficients", "distcoeffs", "distcoeff", "d")
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedLens:
+    """A lens as a calibration states it.
+
+    Attributes:
+        kind: "perspective" or "fisheye", as in `Lens`.
+        intrinsics: (3, 3) float64, integer pixel centres.
+        coefficients: of the distortion, as in `Lens`; zeros where none are stated.
+        size: (height, width) of its pictures, None where it is not stated.
+        views: (N, 6) poses of the board in N pictures, board-to-camera: rotation vector (radians), then translation
+            (units of the square's size); None where they are not stated.
+        file: what states it.
+    """
+
+    kind: Literal["perspective", "fisheye"]
+    intrinsics: np.ndarray
+    coefficients: tuple[float, ...]
+    size: tuple[int, int] | None
+    views: np.ndarray | None
+    file: Path
+
+    def sized(self, height: int, width: int) -> Lens:
+        """The lens for pictures of this size."""
+        return Lens(self.kind, self.intrinsics, self.coefficients, height, width)
+
+
+class Entries(NamedTuple):
+    """What one file states, by name without underscores and capitals."""
+
+    numbers: dict[str, float]
+    texts: dict[str, tuple[str, ...]]
+    matrices: dict[str, np.ndarray]
+
+
+class Rig(NamedTuple):
+    """Two cameras fixed to each other: X_second = rotation X_first + translation, of camera coordinates."""
+
+    rotation: np.ndarray  # (3, 3)
+    translation: np.ndarray  # (3,), units of the square's size
+    file: Path
+
+
+class Board(NamedTuple):
+    """A chessboard."""
+
+    corners: tuple[int, int]  # inner corners along a row and along a column
+    square: float | None  # side of a square, None where it is not stated
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What calibration files state.
+
+    Convention:
+        All of OpenCV: x right, y down, z forward, integer pixel centres, board and first camera to camera.
+
+    Attributes:
+        lenses: by name: "first" and "second" of a rig, otherwise the name of the file, without its ending.
+        rig: how the second camera stands to the first, where that is stated.
+        board: the chessboard, where its corners are stated.
+        pictures: files of the board's pictures, one tuple a camera: two of equal length whose pictures were taken at
+            once, or one, or none.
+        source: the name of the format.
+    """
+
+    lenses: dict[str, CalibratedLens]
+    rig: Rig | None = None
+    board: Board | None = None
+    pictures: tuple[tuple[Path, ...], ...] = field(default=())
+    source: str = "opencv"
+
+
+def calibration_files(folder: Path) -> list[Path]:
+    """The files of FileStorage in a folder, sorted."""
+    return sorted(path for path in folder.iterdir() if is_storage(path))
+
+
+def is_calibration(path: Path) -> bool:
+    """Whether a file, or one in a folder, is what `read_calibration` reads."""
+    return bool(calibration_files(path)) if path.is_dir() else is_storage(path)
+
+
+@refuse_unreadable
+def read_calibration(path: str | Path) -> Calibration:
+    """Read calibrations that OpenCV's FileStorage wrote as YAML, XML or JSON.
+
+    Known are the names of OpenCV's samples: ``camera_matrix`` and ``distortion_coefficients`` with ``image_width``,
+    ``image_height``, ``board_width``, ``board_height``, ``square_size`` and ``extrinsic_parameters``; ``M1 D1 M2 D2``,
+    ``K1 D1 K2 D2`` or ``cameraMatrix1 distCoeffs1`` and so on, with ``R T``, of a rig; ``fisheye_model``; and one list
+    of pictures.
+    (https://docs.opencv.org, tutorial "Camera calibration With OpenCV" and samples calibration and stereo_calib.)
+
+    All files of a folder are taken together, as a rig's lenses, its R and T and the list of its pictures usually lie in
+    three; nothing may be stated twice. Pictures of a list that are not there are left out, with their partner. A JSON
+    file is looked at where it holds a matrix of OpenCV's.
+
+    Convention:
+        OpenCV's, which is ours; nothing is changed.
+
+    Args:
+        path: a file, or a folder of them.
+
+    Returns:
+        Lenses, rig, board and pictures, as far as they are stated.
+
+    Raises:
+        DataError: a file is damaged or too large, crashes its parser, states what is no lens or no rotation, or names
+            a picture outside its folder; two files state the same; or there is nothing to be used.
+
+    Example:
+        >>> from lsmgeo import data
+        >>> calibration = data.read_calibration("intrinsics.yml")  # doctest: +SKIP
+    """
+    path = Path(path)
+    files = calibration_files(path) if path.is_dir() else [path]
+    if not 0 < len(files) <= MOST_FILES:
+        raise DataError(path, f"expected 1 to {MOST_FILES} calibration files (YAML, XML or JSON); found {len(files)}")
+    lenses: dict[str, CalibratedLens] = {}
+    rig = board = None
+    lists: list[tuple[Path, tuple[str, ...]]] = []
+    for file, entries in zip(files, read_storages(files), strict=True):
+        if isinstance(entries, DataError):
+            raise entries
+        for name, lens in _lenses(entries, file):
+            if name in lenses:
+                raise DataError(file, f"states the lens {name!r}, and so does {lenses[name].file.name}; name one file")
+            lenses[name] = lens
+        if (found := _rig(entries, file)) is not None:
+            if rig is not None:
+                raise DataError(file, f"states R and T, and so does {rig.file.name}; name one file")
+            rig = found
+        if (seen := _board(entries, file)) is not None:
+            if board is not None and board.corners != seen.corners:
+                raise DataError(file, f"states a board of {seen.corners} corners, another file {board.corners}")
+            board = seen
+        lists += [(file, names) for names in entries.texts.values() if _are_pictures(names)]
+    if len(lists) > 1:
+        raise DataError(lists[1][0], f"lists pictures, and so does {lists[0][0].name}; name one file")
+    pictures = _pictures(*lists[0]) if lists else ()
+    if not lenses and rig is None and not pictures:
+        raise DataError(path, "states no camera matrix, no R and T, and lists no picture")
+    return Calibration(lenses, rig, board, pictures)
+
+
+def read_storages(paths: Sequence[Path]) -> list[Entries | DataError]:
+    """Read numbers, texts, lists of texts and matrices from the top of FileStorage files.
+
+    Returns:
+        For each file what it states, or the error of one that cannot be used. Matrices are float64.
+    """
+    results: list[Entries | DataError] = []
+    found = isolated(parse_storage, paths, limit=MAX_STORAGE_BYTES, memory=MEMORY, seconds=SECONDS)
+    for path, arrays in zip(paths, found, strict=True):
+        if isinstance(arrays, DataError):
+            results.append(arrays)
+            continue
+        folded = {name.replace("_", "").lower(): array for name, array in arrays.items()}
+        numbers = {name: array for name, array in folded.items() if array.dtype == np.float64 and array.ndim in (0, 2)}
+        wrong = [name for name, array in numbers.items() if not (np.abs(array) <= BEYOND).all()]
+        if len(folded) != len(arrays):
+            reason = "states two values whose names differ in capitals or underscores alone"
+            results.append(DataError(path, reason))
+        elif wrong:
+            reason = f"{wrong[0][:80]!r} must hold finite numbers of at most {BEYOND:g}"
+            results.append(DataError(path, reason))
+        else:
+            results.append(Entries(
+                {name: float(array) for name, array in numbers.items() if array.ndim == 0},
+                {name: tuple(array.ravel().tolist()) for name, array in folded.items() if array.dtype.kind == "U"},
+                {name: array for name, array in numbers.items() if array.ndim == 2},
+            ))  # fmt: skip
+    return results
+
+
+def _lenses(entries: Entries, file: Path) -> Iterator[tuple[str, CalibratedLens]]:
+    for number, name in (("", file.stem), ("1", "first"), ("2", "second")):
+        matrix = _one_of(entries.matrices, MATRICES, number, file)
+        distortion = _one_of(entries.matrices, DISTORTIONS, number, file)
+        if matrix is None:
+            continue
+        if matrix.shape != (3, 3):
+            raise DataError(file, f"{name}: K must be 3 x 3; got {matrix.shape[0]} x {matrix.shape[1]}")
+        check_intrinsics(matrix, file, name)
+        if matrix[0, 1] != 0:
+            raise DataError(file, f"{name}: K has skew, which OpenCV's model of a lens has not")
+        kind: Literal["perspective", "fisheye"] = "fisheye" if entries.numbers.get("fisheyemodel") else "perspective"
+        coefficients = np.zeros(4) if distortion is None else distortion.ravel()
+        if len(coefficients) not in COUNTS[kind]:
+            raise DataError(file, f"{name}: {len(coefficients)} coefficients of distortion; expected {COUNTS[kind]}")
+        if np.abs(coefficients).max() > MOST_COEFFICIENT:
+            raise DataError(file, f"{name}: a coefficient of distortion beyond {MOST_COEFFICIENT:g}")
+        views = entries.matrices.get("extrinsicparameters") if number == "" else None
+        if views is not None and views.shape[1] != 6:
+            raise DataError(file, f"{name}: extrinsic_parameters must have 6 columns; got {views.shape[1]}")
+        size = _whole(entries, ("imageheight", "imagewidth"), MAX_SIDE, file)
+        yield name, CalibratedLens(kind, matrix, tuple(map(float, coefficients)), size, views, file)
+
+
+def _one_of(matrices: dict[str, np.ndarray], names: tuple[str, ...], number: str, file: Path) -> np.ndarray | None:
+    found = [name + number for name in names if name + number in matrices]
+    if len(found) > 1:
+        raise DataError(file, f"states {found[0]} and {found[1]}, which mean the same")
+    return matrices[found[0]] if found else None
+
+
+def _whole(entries: Entries, names: tuple[str, str], most: int, file: Path) -> tuple[int, int] | None:
+    if not all(name in entries.numbers for name in names):
+        return None
+    values = [entries.numbers[name] for name in names]
+    if any(value != int(value) or not 1 <= value <= most for value in values):
+        raise DataError(file, f"{names[0]} and {names[1]} must be whole numbers from 1 to {most}; got {values}")
+    return int(values[0]), int(values[1])
+
+
+def _board(entries: Entries, file: Path) -> Board | None:
+    corners = _whole(entries, ("boardwidth", "boardheight"), MOST_CORNERS, file)
+    if corners is None:
+        return None
+    square = entries.numbers.get("squaresize")
+    if square is not None and square <= 0:
+        raise DataError(file, f"square_size must be positive; got {square:g}")
+    if min(corners) < 2:
+        raise DataError(file, f"a board has 2 corners a side at least; got {corners}")
+    return Board(corners, square)
+
+
+def _rig(entries: Entries, file: Path) -> Rig | None:
+    rotation, translation = entries.matrices.get("r"), entries.matrices.get("t")
+    if rotation is None or translation is None:
+        return None
+    if translation.size != 3 or rotation.size not in (3, 9) or (rotation.size == 9 and rotation.shape != (3, 3)):
+        raise DataError(file, "R must be 3 x 3 (or a rotation vector) and T three numbers")
+    if rotation.size == 3:
+        import cv2
+
+        if np.abs(rotation).max() > 2 * np.pi:
+            raise DataError(file, "R is a rotation vector of more than a turn")
+        rotation = np.asarray(cv2.Rodrigues(rotation.reshape(3, 1))[0])
+    check_rotation(rotation, file, "R")
+    return Rig(rotation, translation.ravel(), file)
+
+
+def _are_pictures(names: tuple[str, ...]) -> bool:
+    return bool(names) and all(name.lower().endswith(SUFFIXES) for name in names)
+
+
+def _pictures(file: Path, names: tuple[str, ...]) -> tuple[tuple[Path, ...], ...]:
+    if len(set(names)) != len(names):
+        raise DataError(file, "lists a picture twice")
+    paths = [child(file.parent, name, file) for name in names]
+    # Two cameras where names apart from their digits alternate, as left01.jpg, right01.jpg, left02.jpg do.
+    kinds = [re.sub(r"\d", "", name) for name in names]
+    if len(names) % 2 == 0 and set(kinds[0::2]) != set(kinds[1::2]) and len(set(kinds)) == 2:
+        pairs = [pair for pair in zip(paths[0::2], paths[1::2], strict=True) if all(path.is_file() for path in pair)]
+        return tuple(zip(*pairs, strict=True))
+    here = tuple(path for path in paths if path.is_file())
+    return (here,) if here else ()

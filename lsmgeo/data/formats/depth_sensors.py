@@ -1,0 +1,215 @@
+"""Recordings of depth sensors: photographs with 16-bit depth, one K, and poses in one table or in files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lsmgeo._checks import describe
+from lsmgeo.data.files import child, parse_floats, read_text, refuse_unreadable
+from lsmgeo.data.formats.depth_files import DepthPng
+from lsmgeo.data.images import image_size
+from lsmgeo.data.posed import MAX_PARAMETER, assemble, check_intrinsics, check_last_row, check_rotation, make_cameras
+from lsmgeo.errors import DataError, OptionError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from lsmgeo.data.posed import PosedImages
+
+__all__ = ["is_rgbd", "is_seven_scenes", "read_rgbd", "read_seven_scenes"]
+
+MAX_TABLE_BYTES = 1 << 26
+MAX_MATRIX_BYTES = 1 << 14
+# Metres or millimetres: no camera of a room or a city is further from the origin.
+FARTHEST = 1e9
+MILLIMETRE = 0.001
+TABLES = ("K.txt", "poses.txt", "frame_index.txt")
+POSES = "frame-*.pose.txt"
+# A sequence has 500 or 1,000 frames; this is an hour of thirty a second.
+MAX_FRAMES = 108_000
+MAX_POSE_BYTES = 4096
+# What the set's authors state, for the camera of depth.
+KINECT = (585.0, 585.0, 320.0, 240.0)
+# Zero is where other writers of this form put no depth, 65535 where the set itself does.
+NO_DEPTH = (0, 65535)
+
+
+def is_rgbd(path: Path) -> bool:
+    """Whether a folder, or a ``poses.txt``, is of the form that `read_rgbd` reads."""
+    if path.is_file():
+        return path.name == "poses.txt" and is_rgbd(path.parent)
+    return all((path / name).is_file() for name in TABLES)
+
+
+@refuse_unreadable
+def read_rgbd(path: str | Path) -> PosedImages:
+    """Read an RGB-D folder with one table of poses, as HoloLens recordings are kept.
+
+    ``K.txt`` holds K (3 x 3), ``poses.txt`` 16 numbers a line, the 4 x 4 pose of one frame row by row,
+    ``frame_index.txt`` the name of that frame on the same line; ``images/`` and ``depth/`` the pictures of these names.
+    (The form of HoloLens sets in DeepVideoMVS: Duzceker et al., "DeepVideoMVS: Multi-view stereo on video with
+    recurrent spatio-temporal fusion", CVPR 2021.)
+
+    Convention:
+        The source has camera-to-world poses, OpenCV axes, integer pixel centres, no distortion, and depth as
+        millimetres of camera z with 0 where there is none; the poses are inverted, and depth comes in metres.
+
+    Frames are matched by name. A frame whose picture is not there is left out, and so is one whose pose holds a number
+    that is not finite, which is how trackers write that they were lost. A frame without a file of depth has none.
+
+    Args:
+        path: the folder, or its ``poses.txt``.
+
+    Returns:
+        The photographs with cameras and depth, no sparse points.
+
+    Raises:
+        DataError: a file is missing, damaged, too large, or names a file outside the folder; or no frame is left.
+
+    Example:
+        >>> from lsmgeo import data
+        >>> scene = data.read_rgbd("hololens")  # doctest: +SKIP
+    """
+    path = Path(path)
+    folder = path.parent if path.is_file() else path
+    K = _read_intrinsics(folder / "K.txt")
+    index, table = folder / "frame_index.txt", folder / "poses.txt"
+    names = [line.strip() for line in read_text(index, MAX_TABLE_BYTES).splitlines() if line.strip()]
+    rows = [line for line in read_text(table, MAX_TABLE_BYTES).splitlines() if line.strip()]
+    if len(names) != len(rows):
+        raise DataError(table, f"holds {len(rows)} poses; frame_index.txt names {len(names)} frames")
+    if len(set(names)) != len(names):
+        raise DataError(index, "names a frame twice")
+    frames = (
+        (
+            name,
+            child(folder / "images", name, index),
+            _parse_pose(row, table, f"line {number}"),
+            child(folder / "depth", str(Path(name).with_suffix(".png")), index),
+        )
+        for number, (name, row) in enumerate(zip(names, rows, strict=True), 1)
+    )
+    return _scene(frames, K, (0,), table, "rgbd")
+
+
+def _parse_pose(text: str, path: Path, where: str) -> np.ndarray | None:
+    """A 4 x 4 pose from 16 numbers; None where one of them is not finite."""
+    tokens = text.split(maxsplit=16)
+    if len(tokens) != 16:
+        raise DataError(path, f"{where}: expected the 16 numbers of a pose")
+    pose = np.array(parse_floats(tokens, path, where, finite=False)).reshape(4, 4)
+    if not np.isfinite(pose).all():
+        return None
+    check_last_row(pose, path, f"{where}: a pose")
+    if np.abs(pose).max() > FARTHEST:
+        raise DataError(path, f"{where}: a pose holds a number beyond {FARTHEST:g}")
+    return pose
+
+
+def _scene(
+    frames: Iterable[tuple[str, Path, np.ndarray | None, Path]],
+    intrinsics: np.ndarray,
+    no_depth: tuple[int, ...],
+    file: Path,
+    source: str,
+) -> PosedImages:
+    """Name, picture, camera-to-world pose and depth of each frame; those without picture or pose are left out."""
+    kept = [
+        (name, picture, pose, DepthPng(depth, MILLIMETRE, no_depth) if depth.is_file() else None)
+        for name, picture, pose, depth in frames
+        if pose is not None and picture.is_file()
+    ]
+    if not kept:
+        raise DataError(file, "leaves no frame: every picture is missing or its pose is not finite")
+    names, paths, poses, depths = zip(*kept, strict=True)
+    for name, pose in zip(names, poses, strict=True):
+        check_rotation(pose[:3, :3], file, name)
+    world_from_cam = np.stack(poses)
+    R = world_from_cam[:, :3, :3].transpose(0, 2, 1)
+    # -R C and not the inverse: rotations are rounded in these files, and the camera's place should not be.
+    t = -(R * world_from_cam[:, None, :3, 3]).sum(-1)
+    cameras = make_cameras([intrinsics] * len(names), R, t, [image_size(path) for path in paths], file)
+    return assemble(names, paths, cameras, source, file=file, depths=depths)
+
+
+def _read_intrinsics(file: Path) -> np.ndarray:
+    tokens = read_text(file, MAX_MATRIX_BYTES).split()
+    if len(tokens) != 9:
+        raise DataError(file, f"expected the 9 numbers of K; got {len(tokens)} items")
+    K = np.array(parse_floats(tokens, file, "K")).reshape(3, 3)
+    check_intrinsics(K, file, "line 1 to 3")
+    return K
+
+
+def is_seven_scenes(path: Path) -> bool:
+    """Whether a folder is a sequence that `read_seven_scenes` reads."""
+    return path.is_dir() and next(path.glob(POSES), None) is not None
+
+
+@refuse_unreadable
+def read_seven_scenes(path: str | Path, *, intrinsics: tuple[float, float, float, float] = KINECT) -> PosedImages:
+    """Read one sequence of 7-Scenes, or of a set kept in its form.
+
+    For each frame ``frame-000000.color.png``, ``.depth.png`` (16-bit millimetres, 0 and 65535 where there is none) and
+    ``.pose.txt`` (4 x 4). (Shotton et al., "Scene coordinate regression forests for camera relocalization in RGB-D
+    images", CVPR 2013.)
+
+    Convention:
+        The source has camera-to-world poses and OpenCV axes; the poses are inverted, and depth comes in metres.
+
+    In the set itself colour and depth are *not registered*: they are pictures of two cameras side by side, with some
+    pixels between them, and only the depth camera's K is stated. Its K and poses are used for both, as is customary;
+    what is compared across the two (the depth at a pixel of colour) is off by that much near edges. The stated
+    principal point is the middle of the picture, so half a pixel in it means nothing.
+
+    A frame without its colour picture is left out, and so is one whose pose holds a number that is not finite (lost
+    tracking). A frame without its depth picture has no depth.
+
+    Args:
+        path: the folder of one sequence, such as ``chess/seq-01``.
+        intrinsics: fx, fy, cx, cy in pixels, integer pixel centres, of all frames.
+
+    Returns:
+        The colour pictures with cameras and depth, in the order of their names; no sparse points.
+
+    Raises:
+        DataError: a file is damaged, too large, or leads outside the folder; or no frame is left.
+        OptionError: intrinsics that are no four numbers, or whose focal lengths are not positive.
+
+    Example:
+        >>> from lsmgeo import data
+        >>> scene = data.read_seven_scenes("chess/seq-01", intrinsics=(525.0, 525.0, 320.0, 240.0))  # doctest: +SKIP
+    """
+    K = _matrix(intrinsics)
+    folder = Path(path)
+    files = sorted(folder.glob(POSES)) if folder.is_dir() else []
+    if not 0 < len(files) <= MAX_FRAMES:
+        raise DataError(folder, f"expected 1 to {MAX_FRAMES} files {POSES}; found {len(files)}")
+    stems = [file.name.removesuffix(".pose.txt") for file in files]
+    frames = (
+        (
+            f"{stem}.color.png",
+            child(folder, f"{stem}.color.png", folder),
+            _parse_pose(read_text(child(folder, file.name, folder), MAX_POSE_BYTES), file, "the pose"),
+            child(folder, f"{stem}.depth.png", folder),
+        )
+        for file, stem in zip(files, stems, strict=True)
+    )
+    return _scene(frames, K, NO_DEPTH, folder, "7-scenes")
+
+
+def _matrix(intrinsics: tuple[float, float, float, float]) -> np.ndarray:
+    try:
+        fx, fy, cx, cy = (float(value) for value in intrinsics)
+    except (TypeError, ValueError):
+        fx = fy = cx = cy = np.nan
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    if not (np.isfinite(K).all() and min(fx, fy) > 0 and np.abs(K).max() <= MAX_PARAMETER):
+        raise OptionError(
+            "read_seven_scenes: intrinsics must be fx, fy, cx, cy in pixels, focal lengths above 0; "
+            f"got {describe(intrinsics)}"
+        )
+    return K

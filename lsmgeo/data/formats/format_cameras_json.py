@@ -1,0 +1,151 @@
+"""Cameras in a plain JSON file of our own: nothing to guess, nothing to convert."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lsmgeo._checks import describe
+from lsmgeo.cameras import CameraTensors
+from lsmgeo.data.files import child, refuse_unreadable
+from lsmgeo.data.formats.depth_files import DepthPng
+from lsmgeo.data.images import has_alpha, image_size
+from lsmgeo.data.json_files import peek_json, read_json, take_array, take_number, take_text
+from lsmgeo.data.posed import PosedImages, assemble, check_camera, check_last_row, check_picture, make_cameras
+from lsmgeo.errors import DataError
+
+__all__ = ["NAME", "is_cameras_json", "read_cameras_json", "state_camera", "state_cameras"]
+
+NAME = "cameras.json"
+FORMAT = "lsmgeo cameras"
+VERSION = 1
+PIXEL_CENTERS = ("integer", "half")
+MOST_CAMERAS = 100_000
+
+
+def is_cameras_json(path: Path) -> bool:
+    """Whether a JSON file, or the ``cameras.json`` of a folder, holds cameras as here."""
+    file = path / NAME if path.is_dir() else path
+    if file.suffix.lower() != ".json" or not file.is_file():
+        return False
+    values = peek_json(file)
+    cameras = values.get("cameras")
+    return values.get("format") == FORMAT or (
+        isinstance(cameras, list) and bool(cameras) and isinstance(cameras[0], dict) and "K" in cameras[0]
+    )
+
+
+@refuse_unreadable
+def read_cameras_json(path: str | Path) -> PosedImages:
+    """Read cameras from a plain JSON file.
+
+    ::
+
+        {
+            "format": "lsmgeo cameras",
+            "version": 1,
+            "pixel_center": "integer",
+            "cameras": [
+                {
+                    "file": "images/a.png",
+                    "width": 640,
+                    "height": 480,
+                    "K": [[...], [...], [...]],
+                    "cam_from_world": [[...], [...], [...], [...]],
+                    "depth": "depth/a.png",
+                    "depth_step": 0.001,
+                },
+                ...,
+            ],
+        }
+
+    A file without ``format`` is taken for one of version 1, ``name`` for ``file``, and ``R`` (3 x 3) with ``t`` (3) for
+    ``cam_from_world``. ``depth`` may be left out: it is a 16-bit PNG of the photograph's size that counts steps of
+    camera z, ``depth_step`` world units each, 0 where there is none.
+
+    Convention:
+        World-to-camera, OpenCV axes; K may have skew. ``pixel_center`` is "integer" (also where it is left out) or
+        "half", where the first pixel is centred at (0.5, 0.5).
+
+    Args:
+        path: the file, or a folder with ``cameras.json``.
+
+    Returns:
+        The photographs with their cameras and depth, cut out where any of them has alpha; no sparse points.
+
+    Raises:
+        DataError: a file is missing, damaged or too large, names a file outside its folder, is of another version, or
+            states a camera that makes no sense or is of another size than its picture.
+    """
+    path = Path(path)
+    file = path / NAME if path.is_dir() else path
+    values = read_json(file)
+    stated = (values.get("format", FORMAT), values.get("version", VERSION))
+    if stated != (FORMAT, VERSION) or isinstance(stated[1], bool):
+        reason = f"format {describe(stated[0])}, version {describe(stated[1])}"
+        raise DataError(file, f"is of {reason}; expected {FORMAT!r}, version {VERSION}")
+    center = values.get("pixel_center", "integer")
+    if center not in PIXEL_CENTERS:
+        raise DataError(file, f"pixel_center must be one of {', '.join(PIXEL_CENTERS)}; got {describe(center)}")
+    entries = values.get("cameras")
+    if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_CAMERAS:
+        raise DataError(file, f"cameras must be a list of 1 to {MOST_CAMERAS} cameras; got {describe(entries)}")
+
+    names, paths, sizes, depths = [], [], [], []
+    intrinsics, poses = np.zeros((len(entries), 3, 3)), np.zeros((len(entries), 3, 4))
+    for view, entry in enumerate(entries):
+        where = f"camera {view}"
+        if not isinstance(entry, dict):
+            raise DataError(file, f"{where}: expected an object; got {describe(entry)}")
+        names.append(take_text(entry, "file" if "file" in entry else "name", file, where))
+        paths.append(child(file.parent, names[-1], file))
+        sizes.append(image_size(paths[-1]))
+        check_picture(_size(entry, file, where), sizes[-1], paths[-1], file, where)
+        intrinsics[view] = take_array(entry, "K", (3, 3), file, where)
+        poses[view] = _pose(entry, file, where)
+        check_camera(intrinsics[view], poses[view, :, :3], file, where)
+        depths.append(_depth(entry, file, where))
+    cameras = make_cameras(intrinsics, poses[:, :, :3], poses[:, :, 3], sizes, file, pixel_center=center)
+    return assemble(names, paths, cameras, "cameras", file=file, depths=depths, cut_out=any(map(has_alpha, paths)))
+
+
+def _depth(entry: dict[str, Any], file: Path, where: str) -> DepthPng | None:
+    if "depth" not in entry:
+        return None
+    step = take_number(entry, "depth_step", file, where)
+    if not step > 0:
+        raise DataError(file, f"{where}: depth_step must be positive; got {step:g}")
+    return DepthPng(child(file.parent, take_text(entry, "depth", file, where), file), step)
+
+
+def _size(entry: dict[str, Any], file: Path, where: str) -> tuple[int, int]:
+    height, width = (take_number(entry, key, file, where) for key in ("height", "width"))
+    if height != round(height) or width != round(width):
+        raise DataError(file, f"{where}: height and width must be whole numbers of pixels")
+    return int(height), int(width)
+
+
+def _pose(entry: dict[str, Any], file: Path, where: str) -> np.ndarray:
+    """World-to-camera, (3, 4)."""
+    if "cam_from_world" not in entry and "R" in entry:
+        R, t = take_array(entry, "R", (3, 3), file, where), take_array(entry, "t", (3,), file, where)
+        return np.column_stack((R, t))
+    pose = take_array(entry, "cam_from_world", (4, 4), file, where)
+    check_last_row(pose, file, f"{where}: cam_from_world")
+    return pose[:3]
+
+
+def state_camera(camera: CameraTensors) -> dict[str, Any]:
+    """What a file says of one camera, leading shape (); nothing is rounded."""
+    K, E = (part.double().tolist() for part in camera[:2])
+    return {"width": int(camera.width), "height": int(camera.height), "K": K, "cam_from_world": E}
+
+
+def state_cameras(entries: Sequence[Mapping[str, Any]]) -> bytes:
+    """The content of a file of cameras, whose pixel centres are integer."""
+    values = {"format": FORMAT, "version": VERSION, "pixel_center": "integer", "cameras": entries}
+    return json.dumps(values, indent=1, allow_nan=False).encode()

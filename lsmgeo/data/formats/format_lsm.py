@@ -1,0 +1,164 @@
+"""The data that came with Learnt Stereo Machines: renderings, depth, cameras and voxels of ShapeNet's objects."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from lsmgeo._checks import check_choice
+from lsmgeo.data.files import child, refuse_unreadable
+from lsmgeo.data.formats.depth_files import DepthPng
+from lsmgeo.data.formats.mat_files import parse_mat
+from lsmgeo.data.images import image_size
+from lsmgeo.data.isolated import isolated
+from lsmgeo.data.posed import PosedImages, Voxels, assemble, check_camera, check_last_row, make_cameras
+from lsmgeo.data.shards.shape_sources import spell_synset
+from lsmgeo.data.shards.shard_metadata import MAX_VIEWS
+from lsmgeo.errors import DataError, OptionError
+from lsmgeo.grids import VoxelGrid
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["is_lsm", "read_lsm", "read_lsm_object", "read_mats"]
+
+RENDER = re.compile(r"render_(0|[1-9][0-9]{0,4})\.png")
+RESOLUTIONS = (32, 64)
+# A step of depth in world units; the largest value means that nothing is there.
+DEPTH_STEP = 10 / 65535
+NO_DEPTH = 65535
+# 128^3 bytes uncompressed fit.
+MAX_MAT_BYTES = 1 << 22
+# Of address space; the libraries take 200 MiB of it.
+MEMORY = 1 << 29
+SECONDS = 60.0
+
+Arrays = dict[str, np.ndarray]
+
+
+def is_lsm(path: Path) -> bool:
+    """Whether a folder holds the renderings of one object."""
+    renders, cameras = (any(True for _ in path.glob(pattern)) for pattern in ("render_*.png", "camera_*.mat"))
+    return renders and cameras
+
+
+@refuse_unreadable
+def read_lsm(path: str | Path, *, voxels: int = 32) -> PosedImages:
+    """Read one object of the LSM release: ``renders/SYNSET/MODEL``, its voxels beside ``renders``.
+
+    A view is ``render_i.png``, ``depth_i.png`` and ``camera_i.mat``; voxels are in
+    ``voxels/modelVoxels32/SYNSET/MODEL.mat``, or 64. (Kar, Haene, Malik, "Learning a multi-view stereo machine",
+    NeurIPS 2017, and the loaders of its code.)
+
+    Convention:
+        The source's ``extrinsic`` is world-to-camera with OpenCV axes; its pixel centres are half-integers, so half a
+        pixel is taken off. Depth is camera z in steps of 10/65535, the largest of them empty. Voxels fill
+        [-0.5, 0.5]^3 and are stored as ``Volume[x, z, n - 1 - y]``.
+
+    Args:
+        path: the object's folder.
+        voxels: the resolution to read, 32 or 64.
+
+    Returns:
+        The views in the order of their numbers, cut out; with depth and voxels where they are there.
+
+    Raises:
+        DataError: a file is missing, damaged, or crashes its parser, which runs in a process of its own.
+        OptionError: another resolution, or SciPy is missing.
+    """
+    check_choice("read_lsm", "voxels", str(voxels), tuple(map(str, RESOLUTIONS)))
+    scene, grids = read_lsm_object(Path(path), (voxels,))
+    return scene if not grids else replace(scene, voxels=Voxels(grids[0], VoxelGrid(len(grids[0]))))
+
+
+def read_lsm_object(folder: Path, resolutions: Sequence[int]) -> tuple[PosedImages, tuple[torch.Tensor, ...]]:
+    """Read one object without voxels, and its occupancy (n, n, n) of the resolutions that are there.
+
+    Raises:
+        DataError: no view, too many, or a file that is missing, damaged, or crashes its parser.
+    """
+    try:
+        views = sorted(int(match[1]) for file in folder.iterdir() if (match := RENDER.fullmatch(file.name)))
+        root = folder.resolve().parents[2]
+        synset, model = folder.resolve().parts[-2:]
+        files = [(side, root / "voxels" / f"modelVoxels{side}" / synset / f"{model}.mat") for side in resolutions]
+        volumes = [(side, child(root, str(file.relative_to(root)), folder)) for side, file in files if file.exists()]
+    except (OSError, RuntimeError, IndexError, ValueError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(folder, f"cannot be read ({error})") from error
+    if not 1 <= len(views) <= MAX_VIEWS:
+        raise DataError(folder, f"must hold render_0.png and so on, {MAX_VIEWS} views at most; found {len(views)}")
+    cameras = [child(folder, f"camera_{view}.mat", folder) for view in views]
+    arrays = []
+    for found in read_mats([*cameras, *(file for _, file in volumes)]):
+        if isinstance(found, DataError):
+            raise found
+        arrays.append(found)
+    solids = zip(volumes, arrays[len(views) :], strict=True)
+    grids = tuple(_occupancy(found, side, file) for (side, file), found in solids)
+    return _scene(folder, views, list(zip(cameras, arrays[: len(views)], strict=True))), grids
+
+
+def read_mats(paths: Sequence[Path]) -> list[Arrays | DataError]:
+    """Read K, extrinsic and Volume from MATLAB files up to version 7.2, as far as each holds them.
+
+    Returns:
+        For each file its arrays, float64 or, beyond 64 elements, bool; or the error of one that cannot be used.
+
+    Raises:
+        OptionError: SciPy is missing.
+    """
+    if find_spec("scipy") is None:
+        raise OptionError("read_mats: MATLAB files need SciPy; install lsmgeo[data]")
+    results = isolated(parse_mat, paths, limit=MAX_MAT_BYTES, memory=MEMORY, seconds=SECONDS)
+    for number, (path, found) in enumerate(zip(paths, results, strict=True)):
+        if isinstance(found, dict):
+            for name, array in found.items():
+                if array.dtype not in (np.float64, np.bool_) or not np.isfinite(array).all():
+                    results[number] = DataError(path, f"{name} must hold finite numbers")
+    return results
+
+
+def _scene(folder: Path, views: Sequence[int], cameras: Sequence[tuple[Path, Arrays]]) -> PosedImages:
+    K, E, sizes, depths = [], [], [], []
+    paths = [child(folder, f"render_{view}.png", folder) for view in views]
+    for view, picture, (file, arrays) in zip(views, paths, cameras, strict=True):
+        for name, shape in (("K", (3, 3)), ("extrinsic", (4, 4))):
+            if name not in arrays or arrays[name].shape != shape:
+                has = arrays[name].shape if name in arrays else "none"
+                raise DataError(file, f"must hold {name}, {shape[0]} x {shape[1]}; found {has}")
+        intrinsics, extrinsic = arrays["K"], arrays["extrinsic"]
+        check_camera(intrinsics, extrinsic[:3, :3], file, "camera")
+        check_last_row(extrinsic, file, "extrinsic")
+        K.append(intrinsics)
+        E.append(extrinsic)
+        sizes.append(image_size(picture))
+        depth = child(folder, f"depth_{view}.png", folder)
+        depths.append(DepthPng(depth, DEPTH_STEP, (NO_DEPTH,)) if depth.exists() else None)
+    poses = np.array(E)
+    return assemble(
+        [path.name for path in paths],
+        paths,
+        make_cameras(K, poses[:, :3, :3], poses[:, :3, 3], sizes, folder, pixel_center="half"),
+        "lsm",
+        file=folder,
+        depths=depths,
+        cut_out=True,
+        category=spell_synset(folder.resolve().parent.name),
+    )
+
+
+def _occupancy(arrays: Arrays, side: int, file: Path) -> torch.Tensor:
+    """(D, H, W), so z, y, x, of ``Volume[x, z, n - 1 - y]``."""
+    volume = arrays.get("Volume")
+    if volume is None or volume.shape != (side,) * 3 or volume.dtype != np.bool_:
+        has = "none" if volume is None else volume.shape
+        raise DataError(file, f"must hold Volume, {side} x {side} x {side} zeros and ones; found {has}")
+    return torch.from_numpy(np.ascontiguousarray(volume[:, :, ::-1].transpose(1, 2, 0)))

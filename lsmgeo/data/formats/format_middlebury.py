@@ -1,0 +1,209 @@
+"""Middlebury's sets: multi-view scenes with one ``*_par.txt``, and stereo pairs of 2014 and 2021 with disparities."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lsmgeo.data.files import child, one_file, parse_floats, parse_ints, plain_files, read_text, refuse_unreadable
+from lsmgeo.data.formats.depth_files import DepthFile, read_pfm
+from lsmgeo.data.images import image_size
+from lsmgeo.data.posed import assemble, check_camera, check_intrinsics, check_picture, make_cameras
+from lsmgeo.errors import DataError
+
+if TYPE_CHECKING:
+    from lsmgeo.data.posed import PosedImages
+
+__all__ = ["Disparity", "is_middlebury", "is_stereo_pair", "read_middlebury", "read_stereo_pair"]
+
+PARAMETERS = "*_par.txt"
+MAX_PARAMETER_BYTES = 1 << 24
+MAX_CALIBRATION_BYTES = 1 << 16
+MOST = 1e7
+# The file rounds to three decimals.
+ROUNDING = 0.01
+NAME = re.compile(r"\w{1,32}")
+MATRIX = re.compile(r"\[([^;\[\]]*);([^;\[\]]*);([^;\[\]]*)\]")
+# The second is the name in version 3 of the benchmark.
+DISPARITIES = (("disp0.pfm", "disp0GT.pfm"), ("disp1.pfm", "disp1GT.pfm"))
+
+
+def is_middlebury(path: Path) -> bool:
+    """Whether a folder holds a file of parameters, or a file is one by its name."""
+    return path.match(PARAMETERS) if path.is_file() else bool(plain_files(path, PARAMETERS))
+
+
+@refuse_unreadable
+def read_middlebury(path: str | Path) -> PosedImages:
+    """Read a Middlebury multi-view scene.
+
+    The file's first line counts the photographs; every other line is ``name K (9) R (9) t (3)`` with the projection
+    ``K [R | t]``. (Seitz, Curless, Diebel, Scharstein, Szeliski, "A comparison and evaluation of multi-view stereo
+    reconstruction algorithms", CVPR 2006.)
+
+    Convention:
+        The source has our own convention (world-to-camera, OpenCV axes, integer pixel centres); nothing is changed.
+
+    Args:
+        path: the scene's folder, or its ``*_par.txt``.
+
+    Returns:
+        The photographs with their cameras, no sparse points.
+
+    Raises:
+        DataError: a file is missing, damaged, too large, names a file outside the folder, or holds no camera.
+    """
+    file = one_file(Path(path), PARAMETERS)
+    lines = [line.split() for line in read_text(file, MAX_PARAMETER_BYTES).splitlines() if line.strip()]
+    if not lines or len(lines[0]) != 1:
+        raise DataError(file, "the first line must be the number of photographs")
+    (count,) = parse_ints(lines[0], file, "line 1")
+    if count != len(lines) - 1 or count < 1:
+        raise DataError(file, f"announces {count} photographs and holds {len(lines) - 1} lines of cameras")
+
+    names, paths, sizes = [], [], []
+    numbers = np.zeros((count, 21))
+    for view, tokens in enumerate(lines[1:]):
+        where = f"line {view + 2}"
+        if len(tokens) != 22:
+            raise DataError(file, f"{where}: expected a name and 21 numbers; got {len(tokens)} items")
+        numbers[view] = parse_floats(tokens[1:], file, where)
+        check_camera(numbers[view, :9].reshape(3, 3), numbers[view, 9:18].reshape(3, 3), file, where)
+        names.append(tokens[0])
+        paths.append(child(file.parent, tokens[0], file))
+        # The format does not state the size, so it comes from the picture's own header.
+        sizes.append(image_size(paths[-1]))
+    K, R, t = np.split(numbers, (9, 18), -1)
+    cameras = make_cameras(K.reshape(-1, 3, 3), R.reshape(-1, 3, 3), t, sizes, file)
+    return assemble(names, paths, cameras, "middlebury", file=file)
+
+
+@dataclass(frozen=True)
+class Disparity(DepthFile):
+    """Depth as the disparity of a rectified pair: Z = f B / (d + doffs).
+
+    Attributes:
+        path: a portable float map of disparities d in pixels, positive, infinite where unknown.
+        focal_length: f in pixels.
+        baseline: B in world units.
+        offset: doffs, cx of the right camera less that of the left, in pixels.
+    """
+
+    path: Path
+    focal_length: float
+    baseline: float
+    offset: float
+
+    def read(self, size: tuple[int, int]) -> np.ndarray:
+        """(H, W) float32 camera z, 0 where the disparity is unknown or means no point before the camera."""
+        shift = read_pfm(self.path, size).astype(np.float64) + self.offset
+        known = np.isfinite(shift) & (shift > 0)
+        depth = self.focal_length * self.baseline / np.where(known, shift, 1.0)
+        # A disparity next to -doffs is a depth that float32 may not hold, and no measurement.
+        known &= depth < np.finfo(np.float32).max
+        return np.where(known, depth, 0.0).astype(np.float32)
+
+
+def is_stereo_pair(path: Path) -> bool:
+    """Whether a folder, or a ``calib.txt``, is of the form that `read_stereo_pair` reads."""
+    if path.is_file():
+        return path.name == "calib.txt" and is_stereo_pair(path.parent)
+    return (path / "calib.txt").is_file() and (path / "im0.png").is_file()
+
+
+@refuse_unreadable
+def read_stereo_pair(path: str | Path) -> PosedImages:
+    """Read a stereo pair of the Middlebury sets of 2014 and 2021.
+
+    ``calib.txt`` holds ``cam0=[f 0 cx; 0 f cy; 0 0 1]``, ``cam1``, ``doffs``, ``baseline``, ``width``, ``height`` and
+    more; ``im0.png`` and ``im1.png`` are the left and the right photograph, ``disp0.pfm`` and ``disp1.pfm`` their
+    disparities. (Scharstein et al., "High-resolution stereo datasets with subpixel-accurate ground truth", GCPR 2014.)
+
+    Equation: a left pixel (x, y) with disparity d is the right pixel (x - d, y), and Z = f B / (d + doffs).
+
+    Convention:
+        Integer pixel centres and OpenCV axes, as ours. The world is the left camera, and its unit that of ``baseline``:
+        millimetres in the published sets.
+
+    Args:
+        path: the folder, or its ``calib.txt``.
+
+    Returns:
+        The left photograph, then the right one, with cameras and what depth there is; no sparse points.
+
+    Raises:
+        DataError: a file is missing, damaged or too large, leads outside the folder, or the two cameras are no
+            rectified pair.
+
+    Example:
+        >>> from lsmgeo import data
+        >>> scene = data.read_stereo_pair("Motorcycle-perfect")  # doctest: +SKIP
+    """
+    path = Path(path)
+    folder = path.parent if path.is_file() else path
+    file = folder / "calib.txt"
+    entries = _entries(file)
+    first, second = (_camera(entries, name, file) for name in ("cam0", "cam1"))
+    offset, baseline = (_number(entries, name, file) for name in ("doffs", "baseline"))
+    if baseline <= 0:
+        raise DataError(file, "baseline must be positive")
+    focal_length = float(first[0, 0])
+    if np.abs(first - second)[[0, 1, 1], [0, 1, 2]].max() > ROUNDING:
+        raise DataError(file, "cam0 and cam1 must share focal length and cy: this is no rectified pair")
+    if abs(second[0, 2] - first[0, 2] - offset) > ROUNDING:
+        raise DataError(file, f"doffs is {offset:g}, but cx of cam1 less that of cam0 {second[0, 2] - first[0, 2]:g}")
+    paths = tuple(child(folder, name, file) for name in ("im0.png", "im1.png"))
+    sizes = [image_size(picture) for picture in paths]
+    if "height" in entries and "width" in entries:
+        stated = tuple(parse_ints([entries["height"], entries["width"]], file, "height and width"))
+        for picture, size in zip(paths, sizes, strict=True):
+            check_picture((stated[0], stated[1]), size, picture, file, "width and height")
+    cameras = make_cameras((first, second), [np.eye(3)] * 2, np.array([[0.0] * 3, [-baseline, 0.0, 0.0]]), sizes, file)
+    depths = []
+    for names in DISPARITIES:
+        here = [child(folder, name, file) for name in names if (folder / name).exists()]
+        depths.append(Disparity(here[0], focal_length, baseline, offset) if here else None)
+    return assemble(("im0.png", "im1.png"), paths, cameras, "middlebury-stereo", file=file, depths=depths)
+
+
+def _entries(file: Path) -> dict[str, str]:
+    entries: dict[str, str] = {}
+    for number, line in enumerate(read_text(file, MAX_CALIBRATION_BYTES).splitlines(), 1):
+        if not line.strip():
+            continue
+        name, equals, value = (part.strip() for part in line.partition("="))
+        if not equals or NAME.fullmatch(name) is None:
+            raise DataError(file, f"line {number}: expected name=value")
+        if name in entries:
+            raise DataError(file, f"line {number}: states {name} twice")
+        entries[name] = value
+    return entries
+
+
+def _stated(entries: dict[str, str], name: str, file: Path) -> str:
+    if name not in entries:
+        raise DataError(file, f"does not state {name}")
+    return entries[name]
+
+
+def _number(entries: dict[str, str], name: str, file: Path) -> float:
+    (value,) = parse_floats([_stated(entries, name, file)], file, name)
+    if abs(value) > MOST:
+        raise DataError(file, f"{name} is beyond {MOST:g}")
+    return value
+
+
+def _camera(entries: dict[str, str], name: str, file: Path) -> np.ndarray:
+    match = MATRIX.fullmatch(_stated(entries, name, file))
+    rows = [] if match is None else [row.split() for row in match.groups()]
+    if [len(row) for row in rows] != [3, 3, 3]:
+        raise DataError(file, f"{name} must be a 3 x 3 matrix [a b c; d e f; g h i]")
+    K = np.array([parse_floats(row, file, name) for row in rows])
+    check_intrinsics(K, file, name)
+    if K[0, 1] != 0 or abs(K[1, 1] - K[0, 0]) > ROUNDING:
+        raise DataError(file, f"{name} must have one focal length and no skew")
+    return K

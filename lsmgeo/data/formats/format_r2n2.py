@@ -1,0 +1,121 @@
+"""Renderings that came with 3D-R2N2: 24 views of a ShapeNet object, and its voxels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from lsmgeo.data.files import child, parse_floats, read_text, refuse_unreadable
+from lsmgeo.data.formats.format_binvox import read_binvox
+from lsmgeo.data.images import image_size
+from lsmgeo.data.posed import PosedImages, assemble, make_cameras
+from lsmgeo.data.shards.shape_sources import spell_synset
+from lsmgeo.data.shards.shard_metadata import MAX_VIEWS
+from lsmgeo.errors import DataError
+
+__all__ = ["METADATA", "is_r2n2", "read_r2n2"]
+
+METADATA = "rendering_metadata.txt"
+NAMES = "renderings.txt"
+MAX_BYTES = 1 << 20
+# A lens of 35 mm before a sensor of 32 mm, and the distance that the last column but one is a fraction of.
+FOCAL_LENGTH_OF_WIDTH = 35 / 32
+MAX_DISTANCE = 1.75
+
+
+def is_r2n2(path: Path) -> bool:
+    """Whether a path is the metadata of renderings, or a folder with it, or with a folder ``rendering`` with it."""
+    if path.is_file():
+        return path.name == METADATA
+    return any((folder / METADATA).is_file() for folder in (path, path / "rendering"))
+
+
+@refuse_unreadable
+def read_r2n2(path: str | Path) -> PosedImages:
+    """Read the renderings of one object as 3D-R2N2 published them.
+
+    ``ShapeNetRendering/SYNSET/MODEL/rendering`` holds the pictures and, a line a view, azimuth, elevation, in-plane
+    rotation (degrees), distance and field of view; ``ShapeNetVox32/SYNSET/MODEL/model.binvox`` the voxels, which may
+    also lie beside ``rendering``. (Choy, Xu, Gwak, Chen, Savarese, "3D-R2N2", ECCV 2016, and its renderer.)
+
+    Equation: f = 35/32 W, c = W/2; C = d (cos e cos a, sin e, cos e sin a) with d = 1.75 distance; the camera looks at
+    the origin, y up, and is turned by the in-plane angle clockwise.
+
+    Convention:
+        Pixel centres are half-integers, so half a pixel is taken off. The field of view is a constant that the renderer
+        never used, and is not read. The voxels are centred on the origin, see `read_binvox`.
+
+    Args:
+        path: the object's folder, its folder ``rendering``, or the metadata in it.
+
+    Returns:
+        The views in the order of the metadata, cut out; with voxels where they are there.
+
+    Raises:
+        DataError: a file is missing, damaged or too large, names a file outside, or holds no camera.
+    """
+    path = Path(path)
+    folder = path.parent if path.is_file() else path if (path / METADATA).is_file() else path / "rendering"
+    file = folder / METADATA
+    lines = [line.split() for line in read_text(file, MAX_BYTES).splitlines() if line.strip()]
+    if not 1 <= len(lines) <= MAX_VIEWS or any(len(line) != 5 for line in lines):
+        raise DataError(file, f"must hold 1 to {MAX_VIEWS} lines of azimuth, elevation, in-plane, distance, fov")
+    numbers = np.array([parse_floats(line, file, f"line {number}") for number, line in enumerate(lines, 1)])
+    if np.abs(numbers[:, :3]).max() > 1e4 or not ((numbers[:, 3] > 1e-3) & (numbers[:, 3] < 1e3)).all():
+        raise DataError(file, "holds an angle beyond 10000 degrees, or a distance that is none")
+    names = _names(folder, len(lines))
+    paths = [child(folder, name, folder / NAMES) for name in names]
+    sizes = [image_size(picture) for picture in paths]
+    height, width = np.array(sizes).T
+    K = np.zeros((len(lines), 3, 3))
+    K[:, 0, 0] = K[:, 1, 1] = FOCAL_LENGTH_OF_WIDTH * width
+    K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = width / 2, height / 2, 1
+    cameras = make_cameras(K, *_poses(numbers), sizes, file, pixel_center="half")
+    home = folder.resolve().parent
+    solid = _solid(home)
+    return assemble(
+        names,
+        paths,
+        cameras,
+        "r2n2",
+        file=file,
+        voxels=None if solid is None else read_binvox(solid, placement="centred"),
+        cut_out=True,
+        category=spell_synset(home.parent.name),
+    )
+
+
+def _names(folder: Path, count: int) -> list[str]:
+    if not (folder / NAMES).exists():
+        return [f"{view:02d}.png" for view in range(count)]
+    names = read_text(folder / NAMES, MAX_BYTES).split()
+    if len(names) != count or len(set(names)) != count:
+        raise DataError(folder / NAMES, f"must name {count} different pictures, as {METADATA} has lines")
+    return names
+
+
+def _poses(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """World-to-camera rotations (V, 3, 3) and translations (V, 3)."""
+    azimuth, elevation, roll = np.radians(numbers[:, :3]).T
+    zero = np.zeros_like(azimuth)
+    # In closed form rather than by looking at the origin: from straight above a camera still has a right-hand side.
+    backward = [np.cos(elevation) * np.cos(azimuth), np.sin(elevation), np.cos(elevation) * np.sin(azimuth)]
+    right = np.stack([np.sin(azimuth), zero, -np.cos(azimuth)], -1)
+    forward = -np.stack(backward, -1)
+    down = np.cross(forward, right)
+    cos, sin = np.cos(roll)[:, None], np.sin(roll)[:, None]
+    R = np.stack([cos * right + sin * down, cos * down - sin * right, forward], 1)
+    return R, np.stack([zero, zero, MAX_DISTANCE * numbers[:, 3]], -1)
+
+
+def _solid(home: Path) -> Path | None:
+    """The voxels of the object, beside its renderings or in the tree that was published beside theirs."""
+    beside = home / "model.binvox"
+    if beside.is_file():
+        return child(home, beside.name, home)
+    if len(home.parents) < 3:
+        return None
+    root = home.parents[2]
+    apart = root / "ShapeNetVox32" / home.parent.name / home.name / "model.binvox"
+    return child(root, str(apart.relative_to(root)), home) if apart.is_file() else None

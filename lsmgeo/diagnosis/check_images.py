@@ -1,0 +1,226 @@
+"""Whatever a path holds, examined; posed photographs are measured as they are, then with likely mistakes undone."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from lsmgeo.data import PosedImages
+from lsmgeo.data.posed import Voxels
+from lsmgeo.diagnosis.evidence import Evidence, Features, Points, gather_evidence, pair_medians
+from lsmgeo.diagnosis.explain import explain, invisible_mistakes, is_suspicious
+from lsmgeo.diagnosis.facts import describe_scene, find_gap, implausibilities
+from lsmgeo.diagnosis.feature_matching import choose_views
+from lsmgeo.diagnosis.findings import LIMITS, Cause, Check, Findings, badness, share, tell
+from lsmgeo.diagnosis.geometry import Hypothesis, as_they_are
+from lsmgeo.diagnosis.half_pixel import Shift, find_shifts, is_certain, is_half_a_pixel, is_large, nearer_half
+from lsmgeo.diagnosis.residuals import reprojection_errors, sampson_distances
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+    from typing import Any
+
+    from lsmgeo.diagnosis.explain import Explanation
+
+__all__ = ["Examination", "examine", "examine_photographs"]
+
+# Of the views, at most this fraction may be off for the others to be believed.
+MOST_OFF = 1 / 3
+LISTED = 5
+SHUFFLED = "frames shuffled"
+# A measurement of right cameras stays this far below its limit, as a multiple of it.
+WELL = 0.5
+LEAST_PAIRS, LEAST_OBSERVED = 2, 10
+
+
+class Examination(NamedTuple):
+    """What was found, and what is needed to draw it."""
+
+    findings: Findings
+    evidence: tuple[Evidence, ...]
+    hypothesis: Hypothesis
+
+
+def examine(content: Any, path: Path) -> Findings:
+    """Say whether cameras, photographs, depth and voxels belong together, and name the likely mistake where not.
+
+    Args:
+        content: what a reader gave: posed photographs, voxels alone, or a calibration.
+        path: where it was read from, for messages.
+
+    Returns:
+        The findings.
+
+    Raises:
+        DataError: a file that is needed is missing or damaged.
+    """
+    if isinstance(content, PosedImages):
+        return examine_photographs(content).findings
+    if isinstance(content, Voxels):
+        from lsmgeo.diagnosis.check_solids import examine_voxels
+
+        return examine_voxels(content, path)
+    from lsmgeo.diagnosis.boards import examine_calibration
+
+    return examine_calibration(content, path)
+
+
+def examine_photographs(scene: PosedImages) -> Examination:
+    """Measure whether cameras, photographs and what came with them belong together, and find the mistake if not.
+
+    Of more than 40 photographs, runs of successive ones are looked at, always the same.
+
+    Args:
+        scene: the photographs; they are read one at a time.
+
+    Returns:
+        The findings, and the evidence for pictures.
+
+    Raises:
+        DataError: a photograph, mask or depth map is missing or damaged.
+    """
+    sizes = np.array([scene.size(view) for view in range(len(scene))])
+    views = choose_views(len(scene))
+    asis = as_they_are(scene)
+    evidence = gather_evidence(scene, views, sizes, asis)
+    checks = [check for item in evidence for check in item.measure_all(asis)]
+    tried: tuple[str, ...] = ()
+    cause, remarks = None, implausibilities(asis.photographs, sizes)
+    passed = all(check.passed for check in checks)
+    with_views, off = _with_views(scene, checks, evidence, asis)
+    if is_suspicious(checks):
+        explanation, tried = explain(asis, evidence, scene.names, sizes, views)
+        if explanation is not None and (off is None or _beats_single_views(explanation, passed=passed)):
+            cause = _told(explanation)
+    if cause is None:
+        shifts = find_shifts(evidence, asis.photographs)
+        half, mended = _half_a_pixel(shifts, asis)
+        # Half a pixel may put one view beyond what is allowed first; without it no view is off.
+        if half is not None and (off is None or _with_views(scene, checks, evidence, mended)[1] is None):
+            checks, cause = (with_views if off is None else checks), half
+        else:
+            checks, cause = with_views, off
+        if cause is None and not passed:
+            remarks.append(f"no single mistake explains this; tried were {', '.join(tried)}, half a pixel")
+        elif cause is None and checks and not any(is_certain(shift) for shift in shifts):
+            remarks.append("half a pixel more or less could not be seen in this data")
+        if cause is None and passed:
+            remarks += [
+                f"the {shift.told_by} agree best with principal points moved by {-shift.x:+.1f}, {-shift.y:+.1f} px"
+                for shift in shifts
+                if is_large(shift)
+            ]
+    if cause is None and passed and checks and (hidden := invisible_mistakes(asis, evidence, sizes)):
+        remarks.append(f"these mistakes would leave no trace in this data: {', '.join(hidden)}")
+    facts = describe_scene(scene, views, evidence, asis, sizes)
+    gap = None if checks or cause is not None else find_gap(scene)
+    findings = Findings(tuple(facts), tuple(checks), cause, tuple(remarks), gap=gap)
+    return Examination(findings, tuple(evidence), asis)
+
+
+def _beats_single_views(explanation: Explanation, *, passed: bool) -> bool:
+    """Whether a mistake is likelier than single wrong views, though all but a few photographs agree."""
+    if explanation.candidate.name == SHUFFLED:
+        # An order that is right mends everything; another camera that suits a wrong view a little mends little.
+        return all(badness(check) <= WELL for check in explanation.after)
+    # What concerns every camera is not wrong where most agree.
+    return not passed
+
+
+def _told(explanation: Explanation) -> Cause:
+    """In words: the checks that the correction improves most."""
+    candidate, before, after, rivals = explanation
+    gains = [badness(old) / badness(new) for old, new in zip(before, after, strict=True)]
+    parts = []
+    for index in np.argsort(gains)[::-1][:2].tolist():
+        if gains[index] > 1.5:
+            old, new = before[index], after[index]
+            parts.append(f"{old.name}: {tell(new.value)} instead of {tell(old.value)} {old.unit}".rstrip())
+    evidence = f"{candidate.corrected}, {'; '.join(parts)}"
+    if rivals:
+        evidence += f" (this data cannot tell it from: {', '.join(rivals)})"
+    return Cause(candidate.name, evidence, candidate.remedy)
+
+
+def _half_a_pixel(shifts: Sequence[Shift], asis: Hypothesis) -> tuple[Cause | None, Hypothesis]:
+    """Half a pixel where most of what is certain tells it, and the cameras without it."""
+    told = [shift for shift in shifts if is_half_a_pixel(shift)]
+    # Evidence that is as certain and says otherwise speaks against it.
+    against = [shift for shift in shifts if is_certain(shift) and not is_half_a_pixel(shift)]
+    if len(told) <= len(against):
+        return None, asis
+    best = min(told, key=lambda shift: max(shift.error_x, shift.error_y))
+    step = nearer_half(best)
+    large, sign = step > 0, np.sign(step)
+    mended = asis._replace(photographs=asis.photographs.shifted(-step, -step), beside=asis.beside.shifted(-step, -step))
+    evidence = (
+        f"the {best.told_by} put the principal points {best.x * sign:.2f} +- {best.error_x:.2f} px (x) and "
+        f"{best.y * sign:.2f} +- {best.error_y:.2f} px (y) too {'far' if large else 'near'}"
+    )
+    remedy = (
+        "cx and cy count pixels from a corner where from the centre of the first pixel is meant: subtract 0.5."
+        if large
+        else "0.5 was subtracted from cx and cy once too often: add 0.5."
+    )
+    return Cause("half a pixel", evidence, remedy), mended
+
+
+def _with_views(
+    scene: PosedImages, checks: list[Check], evidence: Sequence[Evidence], asis: Hypothesis
+) -> tuple[list[Check], Cause | None]:
+    """Add a check of single views, where all others agree; a view that does not is a cause of its own."""
+    found = [_off_by_features(item, asis) for item in evidence if isinstance(item, Features)]
+    found += [_off_by_points(item, asis) for item in evidence if isinstance(item, Points)]
+    off, judged = (set().union(*views) for views in zip((set(), set()), *found, strict=True))
+    if not judged or len(off) > MOST_OFF * len(judged):
+        return checks, None
+    agree = 1 - len(off) / len(judged)
+    checks = [*checks, share("photographs that agree with the others", agree, "views", len(judged), "photographs")]
+    if not off:
+        return checks, None
+    names = ", ".join(scene.names[view] for view in sorted(off)[:LISTED])
+    more = f" and {len(off) - LISTED} more" if len(off) > LISTED else ""
+    evidence_text = f"{names}{more} disagree with all others, which agree with each other"
+    return checks, Cause("some views are off", evidence_text, "Leave these photographs out, or find their poses again.")
+
+
+def _off_by_features(features: Features, asis: Hypothesis) -> tuple[set[int], set[int]]:
+    """Views all of whose pairs are bad, taken away one by one until the others agree."""
+    first, second = features.matches.first, features.matches.second
+    medians = pair_medians(np.abs(sampson_distances(features.matches, asis.photographs)), features.matches)
+    # Where most pairs are bad, no single view is.
+    if not np.median(medians) <= features.limit:
+        return set(), set()
+    bad = medians > _standing_out(medians, features.limit)
+    left = np.ones(len(first), bool)
+    off: set[int] = set()
+    while (bad & left).any():
+        views = np.union1d(first[left], second[left]).tolist()
+        pairs = {view: left & ((first == view) | (second == view)) for view in views}
+        enough = {view: of for view, of in pairs.items() if of.sum() >= LEAST_PAIRS}
+        shares = {view: (float(bad[of].mean()), int(bad[of].sum())) for view, of in enough.items()}
+        if not shares:
+            break
+        view = max(shares, key=lambda view: shares[view])
+        if shares[view][0] < 1:
+            break
+        off.add(view)
+        left &= ~pairs[view]
+    counts = np.bincount(np.concatenate([first, second]))
+    return off, set(np.flatnonzero(counts >= LEAST_PAIRS).tolist())
+
+
+def _standing_out(medians: np.ndarray, limit: float) -> float:
+    """From where on a view or a pair is worse than its fellows: what all share is no single view's."""
+    return float(np.clip(LIMITS["view"] * np.median(medians), limit, LIMITS["view"] * limit))
+
+
+def _off_by_points(points: Points, asis: Hypothesis) -> tuple[set[int], set[int]]:
+    errors, _, views = reprojection_errors(points.points, asis.beside)
+    known = np.flatnonzero(np.bincount(views) >= LEAST_OBSERVED)
+    medians = np.array([np.median(errors[views == view]) for view in known])
+    if not len(known) or not np.median(medians) <= points.limit:
+        return set(), set()
+    return set(known[medians > _standing_out(medians, points.limit)].tolist()), set(known.tolist())

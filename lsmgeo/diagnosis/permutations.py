@@ -1,0 +1,282 @@
+"""Photographs beside the cameras of other photographs: which one belongs to which."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lsmgeo.diagnosis.camera_errors import Candidate
+from lsmgeo.diagnosis.check_silhouettes import draw_solid, intersection_over_union
+from lsmgeo.diagnosis.evidence import Features, Outlines, Points, Solids, is_rectified
+from lsmgeo.diagnosis.findings import counted
+from lsmgeo.diagnosis.residuals import pair_distances, view_costs
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from lsmgeo.diagnosis.evidence import Evidence
+    from lsmgeo.diagnosis.geometry import Geometry, Hypothesis
+
+__all__ = ["assigned", "named_orders", "order_mistakes", "search_order"]
+
+# Costs saturate at so many limits: a wrong pair of cameras is wrong, whether by ten pixels or by a hundred.
+WORST = 4.0
+SEEDS_PER_PAIR, SEEDED_PAIRS, ROUNDS, LEAST_GAIN = 40, 4, 4, 1e-12
+MATCHES_TRIED = 40
+# Outlines are compared one by one: only few views bear all their pairs under all pairs of cameras.
+MOST_OUTLINES = 16
+LISTED = 4
+
+
+def order_mistakes(
+    asis: Hypothesis, names: Sequence[str], evidence: Sequence[Evidence], views: np.ndarray
+) -> list[Candidate]:
+    """Candidates in which photographs are beside other cameras: orders that have names, and those told from evidence.
+
+    Args:
+        asis: the cameras as they are.
+        names: the photographs' names.
+        evidence: what is known.
+        views: the views that were looked at.
+    """
+    count = len(names)
+    orders = [*named_orders(names), *((order, "") for order in _told_orders(asis, evidence, views))]
+    found, seen = [], {tuple(range(count))}
+    for order, words in orders:
+        if tuple(order) in seen:
+            continue
+        seen.add(tuple(order))
+        name, remedy = "frames shuffled", _remedy(order, names, words)
+        if is_rectified(asis.photographs):
+            name, remedy = "left and right exchanged", "The two photographs are exchanged: the first is the right one."
+        corrected = f"with {words}" if words else "with the photographs at the cameras that fit them"
+        photographs = asis.photographs.taken(order)
+        alone = asis._replace(photographs=photographs)
+        # Depth and points may have gone with the photographs, or stayed with the cameras.
+        changed = [alone._replace(beside=asis.beside.taken(order)), alone]
+        if np.ptp(asis.photographs.K, axis=0).any():
+            # Or every photograph has kept its own K, and the poses alone are in another order.
+            changed.append(asis._replace(photographs=photographs._replace(K=asis.photographs.K)))
+        found += [Candidate(name, corrected, remedy, hypothesis) for hypothesis in changed]
+    return found
+
+
+def named_orders(names: Sequence[str]) -> list[tuple[np.ndarray, str]]:
+    """Orders that come of usual slips: (V,) the camera of each photograph, and what to call it.
+
+    Example:
+        >>> from lsmgeo.diagnosis.permutations import named_orders
+        >>> order, words = named_orders(["frame_0", "frame_1", "frame_10", "frame_2"])[0]
+        >>> order.tolist(), words
+        ([0, 1, 3, 2], 'the names ordered by their numbers, not as text')
+    """
+    rows = np.arange(len(names))
+    text = np.array(sorted(range(len(names)), key=lambda row: names[row]), int)
+    number = np.array(sorted(range(len(names)), key=lambda row: _natural(names[row])), int)
+    # Row i of one order belongs to row i of the other.
+    found = [
+        (text[np.argsort(number)], "the names ordered by their numbers, not as text"),
+        (number[np.argsort(text)], "the names ordered as text, not by numbers"),
+        (rows[::-1].copy(), "the order reversed"),
+    ]
+    for shift in sorted(range(1, len(names)), key=lambda shift: min(shift, len(names) - shift)):
+        signed = shift if 2 * shift <= len(names) else shift - len(names)
+        places = f"{counted(abs(signed), 'places')} {'later' if signed > 0 else 'earlier'}"
+        found.append((np.roll(rows, -shift), f"every photograph at the camera {places}"))
+    return [(order, words) for order, words in found if not np.array_equal(order, rows)]
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    # A number of any length is compared by its length and digits, never turned into one.
+    parts = re.findall(r"[0-9]+|[^0-9]+", name)
+    return [(len(part.lstrip("0")) + 1, part.lstrip("0")) if part[0] in "0123456789" else (0, part) for part in parts]
+
+
+def _remedy(order: np.ndarray, names: Sequence[str], words: str) -> str:
+    if words:
+        return f"Photographs stand beside other photographs' cameras; right is {words}."
+    moved = np.flatnonzero(order != np.arange(len(order)))
+    pairs = ", ".join(f"{names[view]} to the camera of {names[order[view]]}" for view in moved[:LISTED])
+    more = f" and {len(moved) - LISTED} more" if len(moved) > LISTED else ""
+    return f"Photographs stand beside other photographs' cameras: {pairs}{more} belong."
+
+
+def _told_orders(asis: Hypothesis, evidence: Sequence[Evidence], views: np.ndarray) -> list[np.ndarray]:
+    """Orders of all views, found from points, from the solid's outlines, or from pairs of views."""
+    found = []
+    count = len(asis.photographs.K)
+    pairs: list[tuple[int, int, np.ndarray]] = []
+    for item in evidence:
+        if isinstance(item, Points):
+            found.append(assigned(np.minimum(view_costs(item.points, asis.beside) / item.limit, 1e3)))
+        elif isinstance(item, Solids) and item.silhouettes is not None:
+            order = np.arange(count)
+            kept = np.array(item.silhouettes.views)
+            order[kept] = kept[assigned(-_overlaps(item, asis.photographs))]
+            found.append(order)
+        elif isinstance(item, Features):
+            pairs += _feature_costs(item, asis.photographs, views)
+        elif isinstance(item, Outlines) and len(item.outlines) <= MOST_OUTLINES:
+            pairs += _outline_costs(item, asis.photographs, views)
+    if pairs and len(views) > 1:
+        first = np.searchsorted(views, [first for first, _, _ in pairs])
+        second = np.searchsorted(views, [second for _, second, _ in pairs])
+        order = np.arange(count)
+        order[views] = views[search_order(first, second, np.stack([costs for _, _, costs in pairs]))]
+        found.append(order)
+    return found
+
+
+def assigned(costs: np.ndarray) -> np.ndarray:
+    """The camera (V,) of each view that makes the sum of costs (V, V) least; views of unknown cost keep theirs if free.
+
+    Example:
+        >>> import numpy as np
+        >>> from lsmgeo.diagnosis.permutations import assigned
+        >>> assigned(np.array([[5.0, 0.1, 5.0], [0.2, 5.0, 5.0], [np.nan, np.nan, np.nan]])).tolist()
+        [1, 0, 2]
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    known = np.isfinite(costs).any(1)
+    filled = np.where(known[:, None], np.nan_to_num(costs, nan=1e6), 1.0 - np.eye(len(costs)))
+    return np.asarray(linear_sum_assignment(filled)[1], int)
+
+
+def _overlaps(solids: Solids, cameras: Geometry) -> np.ndarray:
+    """Intersection over union of each view's outline with the solid in each camera, (N, N)."""
+    assert solids.silhouettes is not None
+    views, masks, steps = solids.silhouettes
+    table = np.zeros((len(views), len(views)))
+    for column, camera in enumerate(views):
+        drawn: dict[tuple[tuple[int, int], int], np.ndarray] = {}
+        for row, (mask, step) in enumerate(zip(masks, steps, strict=True)):
+            key = (mask.shape, step)
+            if key not in drawn:
+                drawn[key] = draw_solid(solids.solid, cameras, camera, *key)
+            table[row, column] = intersection_over_union(drawn[key], mask)
+    return table
+
+
+def _feature_costs(features: Features, cameras: Geometry, views: np.ndarray) -> list[tuple[int, int, np.ndarray]]:
+    """For each pair of matched views what every pair of cameras makes of it, (N, N) in 0..1."""
+    tried = features.matches.thinned(MATCHES_TRIED)
+    rows, columns = (grid.ravel() for grid in np.meshgrid(views, views, indexing="ij"))
+    apart = rows != columns
+    found = []
+    for pair, (first, second) in enumerate(zip(tried.first.tolist(), tried.second.tolist(), strict=True)):
+        costs = np.ones(len(rows))
+        distances = pair_distances(tried.pixels[tried.pair == pair], cameras, rows[apart], columns[apart])
+        costs[apart] = np.minimum(distances / features.limit, WORST) / WORST
+        found.append((first, second, costs.reshape(len(views), len(views))))
+    return found
+
+
+def _outline_costs(outlines: Outlines, cameras: Geometry, views: np.ndarray) -> list[tuple[int, int, np.ndarray]]:
+    found = []
+    for first, second in outlines.pairs:
+        costs = np.ones((len(views), len(views)))
+        for i, j in itertools.permutations(range(len(views)), 2):
+            tangents = outlines.distance(cameras, first, second, int(views[i]), int(views[j]))
+            # Where nothing can be told, the pair speaks neither for nor against.
+            costs[i, j] = np.nanmin([np.mean(tangents) / outlines.limit, WORST]) / WORST if tangents[0] >= 0 else 0.5
+        found.append((first, second, costs))
+    return found
+
+
+def search_order(first: np.ndarray, second: np.ndarray, costs: np.ndarray) -> np.ndarray:
+    """Which camera each of N views has, told from pairs of views: grown from likely pairs, then improved by exchanges.
+
+    Args:
+        first: (P,) views, 0..N-1.
+        second: (P,) views.
+        costs: (P, N, N) in 0..1 what speaks against the pair's views having cameras i and j.
+
+    Returns:
+        (N,) cameras; views without any pair keep theirs where it is free.
+    """
+    count = costs.shape[1]
+    links: list[list[tuple[int, np.ndarray]]] = [[] for _ in range(count)]
+    for pair, (a, b) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
+        links[a].append((b, costs[pair].T))  # row: camera of b, column: camera of a
+        links[b].append((a, costs[pair]))
+
+    # Pairs whose cheapest cameras stand out most tell most.
+    cheap = np.partition(costs.reshape(len(costs), -1), min(count, costs[0].size - 1), axis=1)[:, : count + 1]
+    telling = np.argsort(-(cheap.mean(1) - cheap.min(1)), kind="stable")
+    cameras: dict[int, int] = {}
+    for views in _connected(first, second):
+        within = np.array([pair for pair in telling.tolist() if first[pair] in views])
+        best: dict[int, int] = {}
+        lowest = np.inf
+        for pair in within[:SEEDED_PAIRS].tolist():
+            for place in np.argsort(costs[pair].ravel(), kind="stable")[:SEEDS_PER_PAIR].tolist():
+                i, j = divmod(place, count)
+                if i == j or {i, j} & set(cameras.values()):
+                    continue
+                grown = _grown({int(first[pair]): i, int(second[pair]): j}, links, views, set(cameras.values()))
+                places = [(grown[int(first[other])], grown[int(second[other])]) for other in within]
+                cost = sum(float(costs[other][place]) for other, place in zip(within, places, strict=True))
+                if cost < lowest:
+                    best, lowest = grown, cost
+        cameras |= best
+    return _improved(_completed(cameras, count), first, second, costs)
+
+
+def _connected(first: np.ndarray, second: np.ndarray) -> list[set[int]]:
+    """Groups of views that pairs connect, largest first."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    views = np.union1d(first, second)
+    ends = np.searchsorted(views, first), np.searchsorted(views, second)
+    count, labels = connected_components(coo_array((np.ones(len(first)), ends), (len(views),) * 2), directed=False)
+    return sorted((set(views[labels == label].tolist()) for label in range(count)), key=len, reverse=True)
+
+
+def _grown(
+    cameras: dict[int, int], links: list[list[tuple[int, np.ndarray]]], views: set[int], taken: set[int]
+) -> dict[int, int]:
+    """The views of a group added one by one at the free camera that those they are linked to agree on best."""
+    free = np.ones(len(links), bool)
+    free[[*taken, *cameras.values()]] = False
+    while len(cameras) < len(views):
+        tied = {view: [link for link in links[view] if link[0] in cameras] for view in sorted(views - cameras.keys())}
+        view = max(tied, key=lambda view: len(tied[view]))
+        against = np.sum([table[cameras[other]] for other, table in tied[view]], axis=0)
+        against[~free] = np.inf
+        cameras[view] = int(against.argmin())
+        free[cameras[view]] = False
+    return cameras
+
+
+def _completed(cameras: dict[int, int], count: int) -> np.ndarray:
+    """Views of which nothing is known keep their camera where it is free."""
+    order = np.full(count, -1)
+    order[list(cameras)] = list(cameras.values())
+    kept = np.setdiff1d(np.flatnonzero(order < 0), order)
+    order[kept] = kept
+    order[order < 0] = np.setdiff1d(np.arange(count), order)
+    return order
+
+
+def _improved(order: np.ndarray, first: np.ndarray, second: np.ndarray, costs: np.ndarray) -> np.ndarray:
+    """Cameras of two views exchanged as long as that mends something."""
+
+    def total(order: np.ndarray) -> float:
+        return float(costs[np.arange(len(first)), order[first], order[second]].sum())
+
+    lowest = total(order)
+    for _ in range(ROUNDS):
+        before = lowest
+        for a, b in itertools.combinations(range(len(order)), 2):
+            other = order.copy()
+            other[[a, b]] = order[[b, a]]
+            if (cost := total(other)) < lowest - LEAST_GAIN:
+                order, lowest = other, cost
+        if lowest == before:
+            break
+    return order

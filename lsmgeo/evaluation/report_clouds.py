@@ -1,0 +1,146 @@
+"""The figures of depth: D-LSM beside plane sweep with 5, 10 and 20 views, as shaded depth and as joint point clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lsmgeo.cameras import CameraTensors, select
+from lsmgeo.classical.stereo import points_of
+from lsmgeo.data import Batch
+from lsmgeo.data.sample import first_views
+from lsmgeo.drawing import Picture, as_pixels, draw_depth, draw_points
+from lsmgeo.evaluation.baselines import SWEEP, sweep_views
+from lsmgeo.evaluation.held_out_shapes import Shapes, batches
+from lsmgeo.evaluation.methods import Contender, shared
+from lsmgeo.evaluation.options import Options
+from lsmgeo.evaluation.plots import sheet
+from lsmgeo.evaluation.report import Cell, Report, Row, Table
+from lsmgeo.evaluation.scores import means_of
+from lsmgeo.metrics import depth_errors, point_cloud_scores
+
+__all__ = ["joint_cloud", "report_clouds"]
+
+COUNTS = (5, 10, 20)
+SIDE = 160
+TRUTH = "truth"
+# The nearness that counts in the F-score, world units: about half a voxel of 32.
+NEAR = 0.015
+
+
+def report_clouds(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
+    """Draw depth maps, shaded from a shifted viewpoint, and the clouds of all views together.
+
+    Of each depth map the object's pixels are taken, by the silhouettes, for both methods (plane sweep has no depth at
+    some of them). Kar et al. 2017, figures 4 and 5.
+
+    Args:
+        contenders: depth models of one size of images.
+        shapes: all of which are drawn.
+        views: the largest number, 20 in the paper.
+        options: planes, window.
+
+    Returns:
+        A picture a shape and a PLY file for each cloud; a table of the mean depth error and of the cloud's F-score
+        against the cloud of the true depths.
+
+    Raises:
+        OptionError: models of different sizes.
+    """
+    size = shared(contenders, "size")
+    counts = [count for count in COUNTS if count < views] + [views]
+    pictures, clouds, measured = {}, {}, []
+    methods = (SWEEP, *(contender.name for contender in contenders))
+    for batch in batches(shapes.at(size), views, 1, resolution=None, depth=True, progress=options.progress):
+        shape = batch.name[0]
+        found = {
+            (name, count): depth
+            for count in counts
+            for name, depth in _depths(contenders, batch, count, options).items()
+        }
+        assert batch.depth is not None
+        assert batch.mask is not None
+        found |= {(TRUTH, count): batch.depth[0, :count] for count in counts}
+        found = {key: torch.where(batch.mask[0, : key[1]], depth, 0.0) for key, depth in found.items()}
+        joint = {key: joint_cloud(depth, batch.images[0], select(batch.cameras, 0, 0)) for key, depth in found.items()}
+        pictures[f"clouds-{_file(shape)}"] = _draw(shape, batch, counts, (TRUTH, *methods), found, joint)
+        for (name, count), cloud in joint.items():
+            clouds[f"clouds-{_file(shape)}-{_file(name)}-{count}"] = cloud
+        for name in methods:
+            for count in counts:
+                error = depth_errors(found[name, count], batch.depth[0, :count]).l1.nanmean()
+                scores = point_cloud_scores(joint[name, count][0], joint[TRUTH, count][0], NEAR, cell=NEAR / 2)
+                measured.append((shape, name, count, float(error), scores.f_score))
+    columns = [str(count) for count in counts]
+    tables = [
+        Table(key, title, columns, [Row(name, _means(measured, name, counts, place)) for name in methods], digits)
+        for key, title, place, digits in (
+            ("error", "mean depth error [world units], views:", 3, 4),
+            ("f-score", f"F-score of the cloud at {NEAR}, views:", 4, 3),
+        )
+    ]
+    facts = {"views": counts, "planes": options.planes, "window": options.window, "size": size}
+    by_shape = [
+        dict(zip(("name", "method", "views", "mean depth error", "f_score"), numbers, strict=True))
+        for numbers in measured
+    ]
+    return Report("clouds", tables, facts, by_shape, pictures, clouds)
+
+
+def _depths(contenders: Sequence[Contender], batch: Batch, count: int, options: Options) -> dict[str, Tensor]:
+    """Depth (count, H, W) of every method from the first views of one shape."""
+    images, cameras = batch.images[:, :count], first_views(batch.cameras, count)
+    swept = sweep_views(images[0], select(cameras, 0, 0), planes=options.planes, window=options.window).depth
+    return {SWEEP: swept} | {one.name: one.depths(images, cameras)[0] for one in contenders}
+
+
+def joint_cloud(depth: Tensor, images: Tensor, cameras: CameraTensors) -> tuple[np.ndarray, np.ndarray]:
+    """The points (N, 3) of all depth maps (V, H, W) where there is depth, and their colours (N, 3) uint8.
+
+    Args:
+        depth: (V, H, W) camera z, 0 where there is none.
+        images: at least V, (3, H, W) each.
+        cameras: at least V, of the size of the maps.
+    """
+    positions, colours = [], []
+    for view, one in enumerate(depth):
+        there = one > 0
+        positions.append(points_of(one, select(cameras, 0, view))[there])
+        colours.append(as_pixels(images[view])[there])
+    return torch.cat(positions).numpy(), np.concatenate(colours)
+
+
+def _draw(
+    shape: str,
+    batch: Batch,
+    counts: Sequence[int],
+    methods: Sequence[str],
+    depths: dict[tuple[str, int], Tensor],
+    clouds: dict[tuple[str, int], tuple[np.ndarray, np.ndarray]],
+) -> bytes:
+    camera = select(select(batch.cameras, 0, 0), 0, 0)
+    rows: list[list[Picture | None]] = []
+    for name in methods:
+        shaded: list[Picture | None] = [draw_depth(depths[name, count][0], camera, size=SIDE) for count in counts]
+        if name == TRUTH:
+            shaded[1:] = [None] * len(shaded[1:])  # the first view's is the same
+        drawn = [draw_points(*clouds[name, count], size=SIDE) for count in counts]
+        rows.append([as_pixels(batch.images[0, 0], SIDE) if name == TRUTH else None, *shaded, *drawn])
+    columns = ["first view"]
+    columns += [f"depth, {count} views" for count in counts] + [f"points, {count} views" for count in counts]
+    return sheet(rows, methods, columns, title=f"{shape}: depth of the first view from aside; all points together")
+
+
+def _means(
+    measured: Sequence[tuple[str, str, int, float, float]], name: str, counts: Sequence[int], place: int
+) -> list[Cell]:
+    found = [[float(line[place]) for line in measured if line[1:3] == (name, count)] for count in counts]
+    return [means_of(values, ["all"] * len(values)) for values in found]
+
+
+def _file(name: str) -> str:
+    """A name as files may have it."""
+    return "".join(letter if letter.isalnum() or letter in "-." else "_" for letter in name)

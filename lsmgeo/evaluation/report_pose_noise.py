@@ -1,0 +1,89 @@
+"""The figure of noisy poses: voxel IoU against the angle by which cameras are wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lsmgeo.cameras import CameraTensors, perturb, select, stack
+from lsmgeo.data import Batch
+from lsmgeo.evaluation.baselines import HULL, hull_iou
+from lsmgeo.evaluation.held_out_shapes import Shapes, batches, noise_of
+from lsmgeo.evaluation.methods import Contender, shared
+from lsmgeo.evaluation.options import Options
+from lsmgeo.evaluation.plots import Curve, draw_curves
+from lsmgeo.evaluation.report import Report, Row, Table
+from lsmgeo.evaluation.scores import Scores, iou_by_view, joined
+
+__all__ = ["report_pose_noise", "turned"]
+
+
+def report_pose_noise(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
+    """Measure IoU with cameras turned about the object by random angles up to 0, 5, ... degrees.
+
+    Every camera keeps looking at the object (`lsmgeo.cameras.perturb`), and its axis and the share of the largest angle
+    are the same at all angles, so that curves are of one draw (Kar et al. 2017, appendix A.1).
+
+    Args:
+        contenders: voxel models of one resolution, such as one trained without noise and one with.
+        shapes: what is evaluated on.
+        views: 4 in the paper.
+        options: degrees, seed, threshold, batch.
+
+    Returns:
+        Table "degrees" with the IoU after all views, and a picture of the curves.
+
+    Raises:
+        OptionError: models of different resolutions.
+    """
+    angles = tuple(sorted(set(options.degrees)))
+    resolution = shared(contenders, "resolution")
+    scores = {name: Scores() for name in (*(contender.name for contender in contenders), HULL)}
+    for batch in batches(shapes, views, options.batch, resolution=resolution, progress=options.progress):
+        assert batch.occupancy is not None
+        assert batch.mask is not None
+        found: dict[str, list[Tensor]] = {name: [] for name in scores}
+        for angle in angles:
+            cameras = turned(batch, angle, options.seed)
+            for contender in contenders:
+                last = contender.occupancies(batch.images, cameras, every=False)[:, None]
+                found[contender.name].append(iou_by_view(last, batch.occupancy, options.threshold))
+            found[HULL].append(hull_iou(batch.mask, cameras, batch.occupancy)[:, -1:])
+        for name, parts in found.items():
+            scores[name].add(batch.name, batch.category, torch.cat(parts, 1))
+    columns = [f"{angle:g}°" for angle in angles]
+    rows = [Row(name, one.cells(100)) for name, one in scores.items()]
+    curves = [Curve(name, angles, one.cells(100)) for name, one in scores.items()]
+    return Report(
+        "pose-noise",
+        [Table("degrees", f"voxel IoU [%], {views} views, noise up to:", columns, rows)],
+        {"views": views, "degrees": list(angles), "threshold": options.threshold},
+        joined(scores, "iou"),
+        {
+            "pose-noise": draw_curves(
+                curves,
+                title=f"Noisy poses, {views} views",
+                data=shapes.about,
+                across="largest angle [degrees]",
+                up="voxel IoU [%]",
+            )
+        },
+    )
+
+
+def turned(batch: Batch, degrees: float, seed: int) -> CameraTensors:
+    """The cameras of a batch, each shape's turned by noise of its own.
+
+    Args:
+        batch: the shapes.
+        degrees: largest angle.
+        seed: of the noise.
+    """
+    return stack(
+        [
+            perturb(select(batch.cameras, 0, place), degrees, generator=noise_of(seed, name))
+            for place, name in enumerate(batch.name)
+        ]
+    )

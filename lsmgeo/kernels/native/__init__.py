@@ -1,0 +1,1 @@
+"""Fused C++ kernels for the CPU, and the Python that calls them."""

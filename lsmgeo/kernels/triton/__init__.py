@@ -1,0 +1,1 @@
+"""Fused CUDA kernels in Triton, and the Python that launches them."""

@@ -1,0 +1,121 @@
+"""The small side of the Triton backend: tables of what places the sites, and what their sums mean for the matrices.
+
+Everything here is of the size of the matrices and the axes, in PyTorch and in float64 until the kernels read it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lsmgeo.kernels import reference
+from lsmgeo.kernels.request import Options, Sites
+
+__all__ = ["Tables", "lattice_gradients", "tables"]
+
+
+class Tables(NamedTuple):
+    """The sites of a lattice for the kernels, and what their gradients go back through, float64."""
+
+    views: Tensor  # (B, V, 28), see `forward.FIELDS`
+    x: Tensor  # these four float32
+    y: Tensor
+    z: Tensor  # (B, V, D)
+    depth: Tensor | None  # (B, V, D), of frustums in volumes
+    projective: bool
+    matrix: Tensor  # as in `views`
+    scale: Tensor  # (B, V), of the matrix
+    direction: Tensor | None
+    shrink: Tensor | None  # (B, V), of the direction's matrix
+    exact: Tensor  # z, or the depth of volumes, float64
+
+
+def tables(sites: Sites, options: Options, volume: bool) -> Tables:
+    """Views left out have matrices of zeros: whatever stands in theirs reaches nobody."""
+    mask = sites.view_mask
+    z = reference._per_view(sites.z, sites.matrix)
+    matrix, direction = sites.matrix, sites.direction if options.direction else None
+    if mask is not None:
+        z = torch.where(mask[..., None], z, 1.0)
+        matrix = torch.where(mask[..., None, None], matrix, 0.0)
+        direction = None if direction is None else torch.where(mask[..., None, None], direction, 0.0)
+    one = matrix.new_ones(matrix.shape[:2])
+    kept = one if mask is None else mask.to(one.dtype)
+    scale, shrink = one, None
+    if not volume:  # homogeneous: a factor moves no pixel
+        scale = reference._scale_below_overflow(reference._lattice_extent(matrix, sites._replace(z=z)))
+        matrix = matrix * scale[..., None, None]
+    fields = [matrix.flatten(2), scale[..., None], kept[..., None]]
+    if direction is None:
+        fields.append(one[..., None].expand(-1, -1, 14))
+    else:
+        shrink = 1.0 / reference._power_of_two(direction.abs().amax((-1, -2)))
+        direction = direction * shrink[..., None, None]
+        terms = direction.abs().amax(-2)
+        constant = terms[..., 0] * sites.x.abs().amax(0) + terms[..., 1] * sites.y.abs().amax(0) + terms[..., 3]
+        fields += [direction.flatten(2), constant[..., None], terms[..., 2, None]]
+    depth = 1.0 / z if volume else None
+    return Tables(
+        torch.cat(fields, -1).float().contiguous(),
+        sites.x.float().contiguous(),
+        sites.y.float().contiguous(),
+        z.float().contiguous(),
+        None if depth is None else depth.float().contiguous(),
+        sites.projective,
+        matrix,
+        scale,
+        direction,
+        shrink,
+        z if depth is None else depth,
+    )
+
+
+def lattice_gradients(
+    tables: Tables, options: Options, index_sums: Tensor | None, extra_sums: Tensor | None
+) -> tuple[Tensor, Tensor | None, Tensor]:
+    """From sums over the sites to the gradients of M, G and z: (B, V, 3, 4) twice and (B, V, D).
+
+    Args:
+        tables: of the call.
+        options: of the call.
+        index_sums: (B V, D, blocks, tiles, 9), of the rows of M: of each g x, g y and g.
+        extra_sums: (B V, D, blocks, 13): of depth (g x, g y, g, and through s), and of the rows of G.
+    """
+    shape = (*tables.z.shape, 3, 3)
+    rows, through = tables.matrix.new_zeros(shape), tables.matrix.new_zeros(shape[:3])
+    if index_sums is not None:
+        rows = rows + index_sums.sum((2, 3), dtype=torch.float64).reshape(shape)
+    extra = (
+        None if extra_sums is None else extra_sums.sum(2, dtype=torch.float64).reshape(*shape[:3], extra_sums.shape[-1])
+    )
+    if tables.depth is not None:
+        depth = tables.exact
+        matrix = _outer_sums(rows, depth, torch.ones_like(depth))
+        plane = torch.cat((tables.matrix[..., :2], tables.matrix[..., 3:]), -1)[:, :, None]
+        along = (rows * plane).sum((-1, -2))
+        if options.depth and extra is not None:
+            along = along + extra[..., 3]
+        z_gradient = -along * depth.square()
+        z = 1.0 / depth
+    else:
+        z = tables.exact
+        if options.depth and extra is not None:
+            rows[..., 2, :] += extra[..., :3]
+            if tables.projective:
+                through = -extra[..., 3] / z
+        matrix = _outer_sums(rows, torch.ones_like(z), z) * tables.scale[..., None, None]
+        z_gradient = (rows[..., 2] * tables.matrix[:, :, None, :, 2]).sum(-1) + through
+    direction = None
+    if tables.direction is not None and tables.shrink is not None and extra is not None:
+        turned = extra[..., 4:].unflatten(-1, (3, 3))
+        direction = _outer_sums(turned, torch.ones_like(z), z) * tables.shrink[..., None, None]
+        z_gradient = z_gradient + (turned[..., 2] * tables.direction[:, :, None, :, 2]).sum(-1)
+    return matrix, direction, z_gradient
+
+
+def _outer_sums(rows: Tensor, plane: Tensor, line: Tensor) -> Tensor:
+    """Sums over the planes of (B, V, D, 3, 3) with factors (B, V, D) of the terms in x, y and 1, and in z."""
+    x, y, one = (rows * plane[..., None, None]).sum(2).unbind(-1)
+    return torch.stack((x, y, (rows[..., 2] * line[..., None]).sum(2), one), -1)

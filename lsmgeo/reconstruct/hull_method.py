@@ -1,0 +1,211 @@
+"""From posed photographs with silhouettes to the surface of the visual hull, in the photographs' colours."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from lsmgeo import functional
+from lsmgeo._checks import check_choice, check_whole
+from lsmgeo.cameras import CameraTensors, crop, resize, select, stack
+from lsmgeo.classical.gathering import fitted, resized
+from lsmgeo.classical.silhouettes import signed_distance, silhouettes
+from lsmgeo.classical.surface import drop_specks, extract_mesh
+from lsmgeo.classical.tsdf import voxel_side
+from lsmgeo.classical.views import camera_centers, project
+from lsmgeo.classical.visual_hull import RULES, default_grid, visual_hull
+from lsmgeo.data.meshes import Mesh
+from lsmgeo.errors import OptionError
+from lsmgeo.reconstruct.sweep_method import mesh_facts, named_colour
+from lsmgeo.reconstruct.write_results import Looked, Results
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from lsmgeo.data import PosedImages
+    from lsmgeo.grids import VoxelGrid
+
+__all__ = ["colour_vertices", "hull_depth", "hull_results", "outline_iou"]
+
+# Planes along a ray for every voxel that it crosses, and sites that are looked at in one go.
+PLANES_PER_VOXEL, SITES = 1.0, 1 << 24
+# How far behind the hull's depth, in voxels, a vertex may lie and still be seen.
+BEHIND = 2.0
+SPECK_FACES = 20
+
+
+def hull_results(
+    scene: PosedImages,
+    view: int | None,
+    title: str,
+    *,
+    rule: str,
+    masks: str | None,
+    background: str | None,
+    resolution: int,
+    size: int,
+) -> Results:
+    """Carve the visual hull of all silhouettes and colour its surface.
+
+    Args:
+        scene: posed photographs.
+        view: the one from which the model is looked at first.
+        title: of what is written.
+        rule: "all", a solid that lies in every silhouette; or "mean", in three quarters of them, which forgives wrong
+            silhouettes; see `lsmgeo.classical.visual_hull`.
+        masks: folder of mask files, see `lsmgeo.classical.silhouettes`.
+        background: behind the object: "black", "white", or three numbers from 0 to 1 with commas between.
+        resolution: voxels along the longest side of the hull's box.
+        size: longer side of the silhouettes in pixels; never larger than the photographs.
+
+    Returns:
+        `Results`; depth is where a ray first meets the hull, certain are the photographs' silhouettes.
+
+    Raises:
+        OptionError: no silhouettes are there, one is empty, or nothing projects into all of them.
+        DataError: a photograph or a mask cannot be read.
+    """
+    who = "reconstruct"
+    check_choice(who, "rule", rule, RULES)
+    check_whole(who, "resolution", resolution, 8, 1024)
+    check_whole(who, "size", size, 16)
+    try:
+        found = silhouettes(scene, folder=masks, background=named_colour(background))
+    except OptionError as error:
+        if "no alpha" not in str(error):
+            raise
+        raise OptionError(f"{error}: --masks FOLDER, or --background white, black or R,G,B") from None
+    for number, mask in enumerate(found):
+        if not bool(mask.any()):
+            raise OptionError(f"{who}: the silhouette of view {number} ({scene.names[number]}) is empty")
+    shape = fitted(scene.size(0), size)
+    cameras = stack([resize(scene.camera(number), *shape) for number in range(len(scene))])
+    outlines = torch.stack([resized(mask[None].float(), shape)[0] > 0.5 for mask in found])
+    grid = default_grid(outlines, cameras, resolution)
+    border = outlines.clone()
+    border[:, 1:-1, 1:-1] = False
+    # An object that is cut off by a picture's border goes on beyond it.
+    outside = "unknown" if bool(border.any()) else "empty"
+    soft = torch.stack([signed_distance(mask) for mask in outlines]) if rule == "all" else outlines.float()
+    level = {"all": 0.0, "mean": 0.75}[rule]
+    hull = visual_hull(soft, cameras, grid, rule=rule, threshold=level, outside=outside)
+    if not bool(hull.occupancy.any()):
+        raise OptionError(f"{who}: no voxel lies in the silhouettes; rule='mean' forgives wrong ones")
+    looked, ious = [], []
+    for number, mask in enumerate(tqdm(outlines, desc="hull", unit="view", disable=None)):
+        camera, image = select(cameras, 0, number), resized(scene.load(number), shape)
+        depth = hull_depth(hull.occupancy, grid, camera)
+        ious.append(outline_iou(depth, mask))
+        numbers = (("IoU of silhouette and hull", f"{ious[-1]:.3f}"),)
+        looked.append(Looked(number, image, camera, depth, mask.float(), "silhouette", numbers))
+    mesh = drop_specks(extract_mesh(hull.support, grid, level=level), SPECK_FACES)
+    mesh = colour_vertices(mesh, looked, BEHIND * voxel_side(grid))
+    z, y, x = hull.occupancy.shape
+    volume = 100 * float(hull.occupancy.float().mean())
+    facts = (
+        ("scene", f"{len(scene)} photographs, {scene.source}"),
+        ("hull", f"of {len(ious)} silhouettes, {x} x {y} x {z} voxels (x, y, z), {volume:.1f} % inside"),
+        ("silhouettes", f"IoU with the hull's own {np.mean(ious):.3f} on average, {min(ious):.3f} at least"),
+        *mesh_facts(mesh),
+    )
+    notes: tuple[str, ...] = ()
+    worst = int(np.argmin(ious))
+    if ious[worst] < 0.8:
+        notes = (
+            f"The silhouette of {scene.names[worst]} and the hull have an IoU of {ious[worst]:.2f} alone. Where the "
+            "silhouette holds more than the object, that is background, and harmless; where the hull lacks a piece of "
+            "it, another silhouette or a camera is wrong, which --rule mean forgives.",
+        )
+    looked.sort(key=lambda one: view is not None and one.view != view)
+    return Results(title, facts, notes, tuple(looked), mesh=mesh)
+
+
+def outline_iou(depth: Tensor, mask: Tensor) -> float:
+    """Intersection over union of where a solid is seen, by its depth (h, w), and of a silhouette."""
+    return float(((depth > 0) & mask).sum()) / max(1, int(((depth > 0) | mask).sum()))
+
+
+def hull_depth(occupancy: Tensor, grid: VoxelGrid, camera: CameraTensors) -> Tensor:
+    """Camera z where the rays of a camera first meet occupied voxels, to about a voxel.
+
+    Args:
+        occupancy: (D, H, W) bool.
+        grid: where it lives.
+        camera: leading shape ().
+
+    Returns:
+        (h, w) float32, the camera's size; 0 where a ray meets none.
+    """
+    height, width = int(torch.as_tensor(camera.height)), int(torch.as_tensor(camera.width))
+    depth = torch.zeros(height, width)
+    index = occupancy.nonzero()
+    if not len(index):
+        return depth
+    # The corners of the box of occupied voxels bound their depth, and where they are seen.
+    ends = torch.stack([index.amin(0).flip(0) - 0.5, index.amax(0).flip(0) + 0.5]).double()
+    T = grid.world_from_lattice.double()
+    corners = torch.cartesian_prod(*ends.unbind(1)) @ T[:3, :3].T + T[:3, 3]
+    pixels, z = (part[0] for part in project(stack([camera]), corners.numpy())[:2])
+    # Of the shortest side, so that flat voxels are not stepped over.
+    step = float(T[:3, :3].norm(dim=0).min()) / PLANES_PER_VOXEL
+    nearest, farthest = float(z.min()), float(z.max())
+    start = max(nearest, step) + step / 2
+    top, left, bottom, right = 0, 0, height, width
+    if nearest > step:
+        (x0, y0), (x1, y1) = (end.astype(int).tolist() for end in (np.floor(pixels.min(0)), np.ceil(pixels.max(0))))
+        top, left, bottom, right = max(0, y0), max(0, x0), min(height, y1 + 1), min(width, x1 + 1)
+    if top >= bottom or left >= right or farthest <= start:
+        return depth
+    window = crop(stack([camera]), top, left, bottom - top, right - left)
+    size = bottom - top, right - left
+    seen = depth[top:bottom, left:right]
+    volume = occupancy[None, None].float()
+    planes = torch.arange(start, farthest, step, dtype=torch.float64)
+    for slab in planes.split(max(1, SITES // (size[0] * size[1]))):
+        maps, _ = functional.plane_sweep_project(volume, window, grid, slab, size, mode="nearest")
+        hit = maps[0, 0] > 0.5
+        first = slab.float()[hit.to(torch.uint8).argmax(0)]
+        seen.copy_(torch.where((seen == 0) & hit.any(0), first, seen))
+    return depth
+
+
+def colour_vertices(mesh: Mesh, views: Sequence[Looked], behind: float) -> Mesh:
+    """A mesh with the mean of the colours that its vertices have in the photographs that see them.
+
+    A view counts by the fourth power of the cosine between its ray and the surface's normal, so that those that look
+    straight at a place decide.
+
+    Args:
+        mesh: of any size.
+        views: photographs, cameras and depth of the same surface.
+        behind: how far behind a view's depth a vertex may lie and still be seen, in world units.
+    """
+    import trimesh
+
+    if not len(mesh.vertices):
+        return mesh
+    normals = np.asarray(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals)
+    points = torch.from_numpy(mesh.vertices).float()[None]
+    total, weight = torch.zeros(3, len(mesh.vertices)), torch.zeros(len(mesh.vertices))
+    for view in views:
+        cameras = stack([view.camera])
+        # By "zeros" the outer half pixel would fade to black.
+        colours, _ = functional.unproject_points(view.image[None, None], cameras, points, padding_mode="border")
+        depth, visible = functional.unproject_points(
+            view.depth[None, None, None], cameras, points, mode="nearest", augment=("depth",)
+        )
+        known, z = depth[0, 0]
+        rays = camera_centers(cameras) - mesh.vertices
+        cosine = (rays * normals).sum(1) / np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
+        seen = visible[0, 0] & (known > 0) & (z < known + behind)
+        # Never nothing, so that what is seen at a grazing angle alone has a colour too.
+        each = torch.where(seen, torch.from_numpy(cosine).float().clamp_min(0.03) ** 4, 0.0)
+        total += each * colours[0, 0]
+        weight += each
+    mean = torch.where(weight > 0, total / weight.clamp_min(1e-12), 0.7)
+    rounded = (mean.T * 255).round().clamp(0, 255).to(torch.uint8).numpy()
+    return Mesh(mesh.vertices, mesh.faces, colours=rounded)

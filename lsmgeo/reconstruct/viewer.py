@@ -1,0 +1,143 @@
+"""A model, and the cameras that saw it, to be turned in a browser: one HTML document that loads nothing.
+
+The drawing is three.js's, which trimesh carries in a page of its own; here the model is placed before it, and a few
+controls are added.
+"""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lsmgeo.data.meshes import Mesh
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from trimesh.path import Path3D
+
+    from lsmgeo.cameras import CameraTensors
+    from lsmgeo.reconstruct.write_results import Results
+
+__all__ = ["make_viewer"]
+
+MOST_FACES, MOST_POINTS = 250_000, 200_000
+# Of the model, whose middle is the origin and whose radius is 1: how long a frustum may be, and of the way to its
+# nearest neighbour.
+LONGEST_FRUSTUM, FRUSTUM_OF_GAP = 0.35, 0.6
+USED, UNUSED, REFERENCE = (31, 119, 180), (170, 170, 170), (214, 39, 40)
+PLAIN = (176, 180, 188)
+EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1], [5, 6], [6, 7]])
+
+
+def make_viewer(results: Results, cameras: CameraTensors) -> str:
+    """An HTML document that shows a model as its first view's camera sees it, and lets it be turned.
+
+    Convention:
+        In the document the first camera's y points up, the middle of the model is the origin, and nine tenths of it
+        lie within a radius of 1.
+
+    Args:
+        results: with a surface, or points, or both. Larger ones than a browser likes are thinned: surfaces to 250,000
+            faces, points to 200,000.
+        cameras: leading shape (V,), drawn in colour where their photographs were used.
+    """
+    import trimesh
+    from trimesh.viewer.notebook import scene_to_html
+
+    K, E = (np.asarray(part.double().numpy()) for part in cameras[:2])
+    sizes = np.stack([np.broadcast_to(np.asarray(size), len(K)) for size in cameras[2:]], -1)
+    used = [*(one.view for one in results.views), *results.used]
+    surface, points = results.mesh, results.points
+    seen = points if surface is None or not len(surface.vertices) else surface.vertices
+    low, high = np.percentile(seen, (3, 97), axis=0)
+    middle = (low + high) / 2
+    radius = float(np.quantile(np.linalg.norm(seen - middle, axis=1), 0.97)) or 1.0
+    # OpenGL's axes, which three.js has: y up, looking along -z.
+    turn = np.diag([1.0, -1.0, -1.0]) @ E[used[0], :3, :3]
+
+    def placed(points: np.ndarray) -> np.ndarray:
+        return (points - middle) @ turn.T / radius
+
+    centers = placed(-np.einsum("vji,vj->vi", E[:, :3, :3], E[:, :3, 3]))
+    scene = trimesh.Scene()
+    if surface is not None and len(surface.faces):
+        thin = _thinned(surface)
+        colours = np.broadcast_to(PLAIN, thin.vertices.shape) if thin.colours is None else thin.colours
+        mesh = trimesh.Trimesh(placed(thin.vertices), thin.faces, process=False, vertex_colors=_opaque(colours))
+        scene.add_geometry(mesh, node_name="mesh", geom_name="mesh")
+    if len(points):
+        chosen = np.random.default_rng(0).permutation(len(points))[:MOST_POINTS]
+        cloud = trimesh.PointCloud(placed(points[chosen]), colors=_opaque(results.colours[chosen]))
+        scene.add_geometry(cloud, node_name="points", geom_name="points")
+    scene.add_geometry(_frusta(used, K, E, sizes, centers, turn), node_name="cameras", geom_name="cameras")
+    # The script places the camera; without one trimesh would look for a place itself.
+    scene.set_camera(angles=(0, 0, 0), distance=3, center=(0, 0, 0))
+    stands = []
+    for view in range(len(K)):
+        axes = E[view, :3, :3] @ turn.T  # rows: right, down, forward
+        halves = 0.5 * sizes[view] / (K[view, 1, 1], K[view, 0, 0])  # tangents of half the field, up and aside
+        stands.append(np.concatenate([centers[view], axes[2], -axes[1], halves]).round(6).tolist())
+    settings = {"first": used[0], "stands": stands, "shaded": surface is not None and surface.colours is None}
+    script = files("lsmgeo.reconstruct").joinpath("viewer.js").read_text("utf-8")
+    style = files("lsmgeo.reconstruct").joinpath("viewer.css").read_text("utf-8")
+    added = f"<style>{style}</style><script>const settings = {json.dumps(settings)};\n{script}</script></body>"
+    before, _, after = scene_to_html(scene).rpartition("</body>")
+    return before + added + after
+
+
+def _opaque(colours: np.ndarray) -> np.ndarray:
+    return np.concatenate([colours, np.full((len(colours), 1), 255)], 1).astype(np.uint8)
+
+
+def _frusta(
+    used: Sequence[int], K: np.ndarray, E: np.ndarray, sizes: np.ndarray, centers: np.ndarray, turn: np.ndarray
+) -> Path3D:
+    """Pyramids as lines, with a roof over the upper side of the picture."""
+    from trimesh.path import Path3D
+    from trimesh.path.entities import Line
+
+    length = LONGEST_FRUSTUM
+    if len(centers) > 1:
+        from scipy.spatial import cKDTree
+
+        # Cameras that turned in their place have no gap.
+        gaps = cKDTree(np.unique(centers.round(6), axis=0)).query(centers, k=2)[0].max(1)
+        length = float(np.clip(FRUSTUM_OF_GAP * np.median(gaps), 0.1, LONGEST_FRUSTUM))
+    lines, colours = [], []
+    # The first is drawn last: it is seen where another stands in its place.
+    for view in sorted(range(len(centers)), key=lambda view: view == used[0]):
+        (height, width), center = sizes[view], centers[view]
+        left, right, top, bottom = -0.5, width - 0.5, -0.5, height - 0.5
+        roof = top - 0.25 * height
+        corners = [(left, top), (right, top), (right, bottom), (left, bottom)]
+        corners += [(0.7 * left + 0.3 * right, top), ((left + right) / 2, roof), (0.3 * left + 0.7 * right, top)]
+        rays = np.array([(x, y, 1) for x, y in corners]) @ np.linalg.inv(K[view]).T
+        rays /= max(1.0, float(np.abs(rays[:4, :2]).max()))
+        nodes = np.concatenate([center[None], center + length * rays @ E[view, :3, :3] @ turn.T])
+        lines.append(nodes[EDGES])
+        colour = REFERENCE if view == used[0] else USED if view in used else UNUSED
+        colours.append(np.tile((*colour, 255), (len(EDGES), 1)))
+    entities = [Line([2 * index, 2 * index + 1]) for index in range(len(lines) * len(EDGES))]
+    return Path3D(entities, np.concatenate(lines).reshape(-1, 3), process=False, colors=np.concatenate(colours))
+
+
+def _thinned(surface: Mesh) -> Mesh:
+    """Vertices in the same cell of a lattice become one, the coarser the lattice the fewer faces are left."""
+    cells = 512.0
+    thin = surface
+    low, side = surface.vertices.min(0), float(np.ptp(surface.vertices, axis=0).max())
+    while len(thin.faces) > MOST_FACES:
+        cells *= 0.85
+        keys = np.floor((surface.vertices - low) * (cells / side)).astype(np.int64)
+        inverse = np.unique(keys @ [1, 1 << 20, 1 << 40], return_inverse=True)[1]
+        faces = inverse[surface.faces]
+        apart = (faces != np.roll(faces, 1, 1)).all(1)
+        values = np.column_stack([surface.vertices, *([] if surface.colours is None else [surface.colours])])
+        means = np.stack([np.bincount(inverse, column) for column in values.T], -1) / np.bincount(inverse)[:, None]
+        colours = None if surface.colours is None else means[:, 3:].round().astype(np.uint8)
+        thin = Mesh(means[:, :3], faces[apart], colours=colours)
+    return thin

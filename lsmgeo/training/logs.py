@@ -1,0 +1,211 @@
+"""What a run tells while it goes: lines of JSON, TensorBoard, pictures, and a bar or a line now and then."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import math
+import os
+import sys
+import time
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lsmgeo.data.files import write_atomic
+from lsmgeo.data.images import encode_png
+from lsmgeo.errors import DataError
+from lsmgeo.training.config import RunConfig
+from lsmgeo.training.example_figures import draw_examples
+from lsmgeo.training.validation import Evaluation
+
+__all__ = ["RunLog"]
+
+LOG = "log.jsonl"
+SECONDS_BETWEEN_LINES = 30.0
+
+
+class RunLog:
+    """The log of a run, written by its first process; the others hold one that does nothing.
+
+    A full disk does not end the run: the first line that cannot be written warns, and later ones are tried again.
+
+    Args:
+        folder: the run's folder.
+        run: says where it ends, and whether to write for TensorBoard.
+        step: where the run begins or goes on; what TensorBoard shows from later steps is replaced.
+        is_writer: whether this process writes.
+        quiet: whether to show no progress.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        run: RunConfig,
+        *,
+        step: int,
+        is_writer: bool = True,
+        quiet: bool = False,
+    ) -> None:
+        self.folder, self.is_writer = folder, is_writer
+        self._warned: set[str] = set()
+        self._shown = time.monotonic()
+        self._board = self._open_board(step) if is_writer and run.tensorboard else None
+        self._bar: Any = None
+        self._prints = is_writer and not quiet
+        if self._prints and sys.stderr.isatty():
+            from tqdm import tqdm
+
+            self._bar = tqdm(total=run.steps, initial=step, unit="step", dynamic_ncols=True, smoothing=0.05)
+
+    def close(self) -> None:
+        """Write what is left."""
+        if self._bar is not None:
+            self._bar.close()
+        if self._board is not None:
+            with contextlib.suppress(OSError):
+                self._board.close()
+
+    def event(self, name: str, **values: Any) -> None:
+        """Append a line.
+
+        Args:
+            name: what happened.
+            values: what JSON holds; numbers that are not finite become text.
+        """
+        if not self.is_writer:
+            return
+        line = json.dumps({"event": name, **_plain(values), "time": round(time.time(), 3)}, allow_nan=False)
+        try:
+            _append_line(self.folder / LOG, line.encode())
+        except OSError as error:
+            self._warn(LOG, f"{self.folder / LOG}: cannot be written ({error}); the run goes on")
+
+    def step(self, step: int, *, waited: float, **values: float) -> None:
+        """A step's line, and its curves.
+
+        Args:
+            step: how many steps have been taken.
+            waited: seconds for which the step waited for data.
+            values: loss, gradient_norm, learning_rate, epoch, seconds of training so far.
+        """
+        self.event("step", step=step, **values, waited=_short(waited))
+        self.scalars(step, {f"train/{name}": value for name, value in values.items()})
+
+    def evaluation(self, step: int, found: Evaluation, *, seconds: float, best: int | None) -> None:
+        """What an evaluation found: a line, curves and pictures.
+
+        Args:
+            step: how many steps had been taken.
+            found: by the evaluation.
+            seconds: that it took.
+            best: the step of the best so far.
+        """
+        self.event("evaluation", step=step, **found.fields(), evaluation_seconds=_short(seconds), best=best)
+        by_view = {f"{found.measure}/{view}_views": value for view, value in found.by_view.items()}
+        by_category = {f"{found.measure}_by_category/{name}": value for name, value in found.categories.items()}
+        self.scalars(step, {"loss/held_back": found.loss, **by_view, **by_category})
+        self.say(f"step {step}: {found.title} {found.words}")
+        if found.examples and self.is_writer:
+            self.picture(step, draw_examples(found.examples))
+
+    def plan(self, steps: int) -> None:
+        """The number of steps is known."""
+        self.event("plan", steps=steps)
+        self.say(f"{steps} steps fill the CPU minutes")
+        if self._bar is not None:
+            self._bar.total = steps
+
+    def scalars(self, step: int, values: Mapping[str, float]) -> None:
+        """Curves for TensorBoard."""
+        if self._board is not None:
+            with self._forgiven():
+                for name, value in values.items():
+                    self._board.add_scalar(name, value, step)
+
+    def picture(self, step: int, picture: npt.NDArray[np.uint8]) -> None:
+        """What is predicted (h, w, 3): for TensorBoard, and as ``pictures/predicted_STEP.png``."""
+        try:
+            write_atomic(self.folder / "pictures" / f"predicted_{step:08d}.png", encode_png(picture))
+        except DataError as error:
+            self._warn("pictures", f"{error}; the run goes on")
+        if self._board is not None:
+            with self._forgiven():
+                self._board.add_image("predicted", picture, step, dataformats="HWC")
+
+    def progress(self, step: int, text: str) -> None:
+        """Show where the run is: at every call on a terminal, elsewhere a line every half minute."""
+        if self._bar is not None:
+            self._bar.update(step - self._bar.n)
+            self._bar.set_postfix_str(text, refresh=False)
+        elif self._prints and time.monotonic() - self._shown >= SECONDS_BETWEEN_LINES:
+            self._shown = time.monotonic()
+            print(f"step {step}: {text}", file=sys.stderr, flush=True)
+
+    def say(self, text: str) -> None:
+        """Print a line."""
+        if self._bar is not None:
+            self._bar.write(text, file=sys.stderr)
+        elif self._prints:
+            print(text, file=sys.stderr, flush=True)
+
+    def _open_board(self, step: int) -> Any:
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+
+            return SummaryWriter(str(self.folder / "tensorboard"), purge_step=step or None)
+        except ImportError:
+            warnings.warn("tensorboard is not installed: log.jsonl and pictures alone are written", stacklevel=3)
+        except OSError as error:
+            self._warn("tensorboard", f"TensorBoard's files cannot be written ({error}); the run goes on")
+        return None
+
+    @contextlib.contextmanager
+    def _forgiven(self) -> Any:
+        try:
+            yield
+        # Its writer is a thread, whose errors come with a later call.
+        except (OSError, RuntimeError) as error:
+            self._board = None
+            self._warn("tensorboard", f"TensorBoard's files cannot be written ({error}); the run goes on without")
+
+    def _warn(self, what: str, message: str) -> None:
+        if what not in self._warned:
+            self._warned.add(what)
+            warnings.warn(message, stacklevel=3)
+
+
+def _append_line(path: Path, line: bytes) -> None:
+    """Append a whole line, or raise and leave the file as it was."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
+    try:
+        size = os.fstat(descriptor).st_size
+        # A loss of power may have left half a line.
+        begin = b"\n" if size and os.pread(descriptor, 1, size - 1) != b"\n" else b""
+        content = begin + line + b"\n"
+        if os.write(descriptor, content) < len(content):  # there was room for a part
+            os.ftruncate(descriptor, size)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    finally:
+        os.close(descriptor)
+
+
+def _short(value: float) -> float:
+    """Six digits of a time."""
+    return float(f"{value:.6g}")
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON holds it."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(one) for one in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    return value if isinstance(value, (str, int, bool, type(None))) else str(value)

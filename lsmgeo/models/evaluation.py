@@ -1,14 +1,5 @@
 """The old place of `lsmgeo.evaluation`, for this version."""
 
-from typing import Any
+from lsmgeo._old_names import moved_to
 
-
-def __getattr__(name: str) -> Any:
-    import warnings
-
-    from lsmgeo import evaluation
-
-    if name.startswith("__"):
-        raise AttributeError(name)
-    warnings.warn("lsmgeo.models.evaluation is now lsmgeo.evaluation", DeprecationWarning, stacklevel=2)
-    return getattr(evaluation, name)
+__getattr__ = moved_to("lsmgeo.evaluation", __name__)

@@ -1,14 +1,5 @@
 """The old place of `lsmgeo.training`, for this version."""
 
-from typing import Any
+from lsmgeo._old_names import moved_to
 
-
-def __getattr__(name: str) -> Any:
-    import warnings
-
-    from lsmgeo import training
-
-    if name.startswith("__"):
-        raise AttributeError(name)
-    warnings.warn("lsmgeo.models.training is now lsmgeo.training", DeprecationWarning, stacklevel=2)
-    return getattr(training, name)
+__getattr__ = moved_to("lsmgeo.training", __name__)

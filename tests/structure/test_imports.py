@@ -21,12 +21,13 @@ MODULES = {
 }
 
 # Layers of the core, lowest first; a layer's modules import those named, and no others of the library.
-SHARED = {"errors", "_checks", "_dtypes", "_linalg", "debugging"}
+SHARED = {"errors", "_checks", "_dtypes", "_linalg", "_old_names", "debugging"}
 MAY_IMPORT = {
     "errors": set(),
     "_checks": {"errors"},
     "_dtypes": set(),
     "_linalg": set(),
+    "_old_names": set(),
     "debugging": set(),
     "cameras": SHARED | {"cameras"},
     "grids": SHARED | {"cameras"},

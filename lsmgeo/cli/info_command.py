@@ -22,7 +22,7 @@ def info(path: str, out: str = "lsmgeo-info") -> int:
     from lsmgeo import data
     from lsmgeo.data.formats.detection import detect
     from lsmgeo.diagnosis import examine
-    from lsmgeo.diagnosis.check_images import examine_photographs
+    from lsmgeo.diagnosis.check_images import examine_images
     from lsmgeo.diagnosis.examination_figures import draw_examination
     from lsmgeo.diagnosis.findings import report
 
@@ -31,7 +31,7 @@ def info(path: str, out: str = "lsmgeo-info") -> int:
     content = detect(source).read(source)
     drawn: dict[str, tuple[str, bytes]] = {}
     if isinstance(content, data.PosedImages):
-        examination = examine_photographs(content)
+        examination = examine_images(content)
         findings = examination.findings
         verdict = findings.verdict if findings.cause is None else findings.cause.name
         drawn = draw_examination(content, examination, f"{source.resolve().name}: {verdict}")

@@ -71,6 +71,16 @@ class Voxels(NamedTuple):
     occupancy: torch.Tensor  # (D, H, W) bool
     grid: VoxelGrid
 
+    @property
+    def world_from_lattice(self) -> np.ndarray:
+        """(4, 4) float64, from voxel index (x, y, z) to world."""
+        return self.grid.world_from_lattice.double().reshape(-1, 4, 4)[0].numpy()
+
+    @property
+    def voxel_size(self) -> float:
+        """Side of a cube with the volume of one voxel, in world units."""
+        return float(np.cbrt(abs(np.linalg.det(self.world_from_lattice[:3, :3]))))
+
 
 @dataclass(frozen=True, eq=False)
 class PosedImages:

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lsmgeo.diagnosis.findings import counted
-from lsmgeo.diagnosis.geometry import homogeneous
+from lsmgeo.diagnosis.two_view_geometry import homogeneous
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from lsmgeo.data import Voxels
-    from lsmgeo.diagnosis.geometry import Geometry
+    from lsmgeo.diagnosis.two_view_geometry import Geometry
 
 __all__ = ["Content", "draw_cameras", "surface_of"]
 
@@ -53,14 +53,13 @@ def surface_of(voxels: Voxels) -> Content:
     """The occupied voxels that have an empty neighbour, and the directions in which they are empty."""
     from scipy.ndimage import binary_erosion
 
-    T = voxels.grid.world_from_lattice.double().reshape(-1, 4, 4)[0].numpy()
+    T = voxels.world_from_lattice
     occupied = np.pad(voxels.occupancy.numpy().transpose(2, 1, 0).astype(np.float32), 1)
     outwards = -np.stack(list(np.gradient(occupied)), -1)
     index = np.argwhere((occupied > 0) & ~binary_erosion(occupied))
     normals = outwards[tuple(index.T)] @ np.linalg.inv(T[:3, :3])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    cell = float(np.cbrt(abs(np.linalg.det(T[:3, :3]))))
-    return Content((index - 1) @ T[:3, :3].T + T[:3, 3], "0.45", normals, cell)
+    return Content((index - 1) @ T[:3, :3].T + T[:3, 3], "0.45", normals, voxels.voxel_size)
 
 
 def draw_cameras(figure: Figure, cameras: Geometry, content: Content, sizes: np.ndarray, colours: np.ndarray) -> None:
@@ -77,7 +76,7 @@ def draw_cameras(figure: Figure, cameras: Geometry, content: Content, sizes: np.
     words = f"thick: the upper side of the picture; dotted: the optical axis; {told}"
     figure.supxlabel(words, fontsize=9)
     panels = list(zip(figure.subplots(1, 2), (above, aside), ("from above", "from the side"), strict=True))
-    length, meeting = _frustum_length(cameras.centers, content.points), _meeting(cameras)
+    length, meeting = _frustum_length(cameras.centers, content.points), _common_point(cameras)
     for axes, view, name in panels:
         axes.set_title(f"{counted(len(cameras.K), 'cameras')} {name}")
         places = _draw_frusta(axes, cameras, view, sizes, colours, length)
@@ -181,7 +180,7 @@ def _mark(axes: Axes, meeting: np.ndarray | None, view: _View) -> None:
         axes.legend(fontsize=7, loc="best", framealpha=0.8)
 
 
-def _meeting(cameras: Geometry) -> np.ndarray | None:
+def _common_point(cameras: Geometry) -> np.ndarray | None:
     """The point nearest to all optical axes, if it is near to them and before most cameras."""
     directions = np.linalg.inv(cameras.R)[:, :, 2]
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)

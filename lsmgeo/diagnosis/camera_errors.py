@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.geometry import Geometry, Hypothesis, scaling
+from lsmgeo.diagnosis.two_view_geometry import Geometry, Hypothesis, scaling
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 __all__ = [
-    "Candidate", "camera_mistakes", "depth_mistakes", "depth_scaled", "focal_scaled", "resolution_mistakes", "scaled",
+    "Candidate", "camera_candidates", "depth_candidates", "depth_scaled", "focal_scaled", "resolution_candidates",
+    "scaled",
 ]  # fmt: skip
 
 DIRECTIONS = (("right", "left"), ("down", "up"), ("forward", "back"))
@@ -41,11 +42,11 @@ class Candidate(NamedTuple):
     hypothesis: Hypothesis
 
 
-def camera_mistakes(asis: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
+def camera_candidates(stated: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
     """Mistakes that concern every camera alike, common ones first.
 
     Args:
-        asis: the cameras as they are.
+        stated: the cameras as they are.
         sizes: (V, 2) height and width of the photographs.
     """
     inverse = (
@@ -115,25 +116,25 @@ def camera_mistakes(asis: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
             lambda cameras: _flipped(cameras, sizes, 0),
         ),
     ]
-    found = [Candidate(*row[:3], _both(asis, row[3])) for row in table]
+    found = [Candidate(*row[:3], _both(stated, row[3])) for row in table]
     for turn, words in _other_axes():
         remedy = f"The cameras' x, y, z axes point {words}: bring them to right, down, forward."
-        turned = _both(asis, partial(_turned, turn=turn))
-        both = _both(asis, lambda cameras, turn=turn: _turned(_inverted(cameras), turn))  # type: ignore[misc]
+        turned = _both(stated, partial(_turned, turn=turn))
+        both = _both(stated, lambda cameras, turn=turn: _turned(_inverted(cameras), turn))  # type: ignore[misc]
         found.append(Candidate("other camera axes", f"with axes {words}", remedy, turned))
         found.append(Candidate("other camera axes", f"inverted, with axes {words}", f"{inverse} {remedy}", both))
     return found
 
 
-def resolution_mistakes(asis: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
+def resolution_candidates(stated: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
     """K of photographs of another size: by powers of two, and by what would centre the principal points."""
-    middles = (np.median(sizes[:, ::-1], axis=0) / 2) / (np.median(asis.photographs.K[:, :2, 2], axis=0) + 0.5)
+    middles = (np.median(sizes[:, ::-1], axis=0) / 2) / (np.median(stated.photographs.K[:, :2, 2], axis=0) + 0.5)
     hints = [middles, np.full(2, middles.mean())] if (middles > 0.05).all() and (middles < 20).all() else []
     factors = [*(np.full(2, 2.0**power) for power in (-1, 1, -2, 2, -3, 3)), *hints]
-    return [scaled(asis, factor) for factor in factors if np.abs(np.log(factor)).max() > 0.02]
+    return [scaled(stated, factor) for factor in factors if np.abs(np.log(factor)).max() > 0.02]
 
 
-def scaled(asis: Hypothesis, factor: np.ndarray) -> Candidate:
+def scaled(stated: Hypothesis, factor: np.ndarray) -> Candidate:
     """All of K multiplied, with half-integer pixel centres, by (2,) factors along x and y."""
     told = f"{factor[0]:.4g}"
     if not np.isclose(factor[0], factor[1], rtol=1e-3):
@@ -142,38 +143,38 @@ def scaled(asis: Hypothesis, factor: np.ndarray) -> Candidate:
         f"K belongs to photographs of another size: multiply fx and cx, fy and cy by {told} "
         "(lsmgeo.cameras.resize keeps the half pixel right), or use the photographs of K's size."
     )
-    changed = _both(asis, lambda cameras: cameras._replace(K=scaling(*factor) @ cameras.K))
+    changed = _both(stated, lambda cameras: cameras._replace(K=scaling(*factor) @ cameras.K))
     return Candidate("K of another resolution", f"with K times {told}", remedy, changed)
 
 
-def focal_scaled(asis: Hypothesis, scale: float) -> Candidate:
+def focal_scaled(stated: Hypothesis, scale: float) -> Candidate:
     """Focal lengths multiplied, while the principal points are right."""
     factor = np.array([[scale, scale, 1.0]] * 2 + [[1.0, 1.0, 1.0]])
     remedy = f"The focal lengths are off by a factor of {scale:.4g}: check angles, units and which side is meant"
     # Both bend the same rays; far from 1, no principal point would do it.
     remedy += "." if abs(np.log(scale)) > 0.2 else "; or it is the principal points that are off."
-    changed = _both(asis, lambda cameras: cameras._replace(K=cameras.K * factor))
+    changed = _both(stated, lambda cameras: cameras._replace(K=cameras.K * factor))
     return Candidate("focal length off", f"with focal lengths times {scale:.4g}", remedy, changed)
 
 
-def depth_scaled(asis: Hypothesis, scale: float) -> Candidate:
+def depth_scaled(stated: Hypothesis, scale: float) -> Candidate:
     """Depth multiplied."""
     remedy = f"Depth and translations are in different units: multiply depth by {scale:.4g}."
     corrected = f"with depth times {scale:.4g}"
-    return Candidate("depth in other units", corrected, remedy, asis._replace(depth_scale=scale))
+    return Candidate("depth in other units", corrected, remedy, stated._replace(depth_scale=scale))
 
 
-def depth_mistakes(asis: Hypothesis) -> list[Candidate]:
+def depth_candidates(stated: Hypothesis) -> list[Candidate]:
     """Depth along the ray, and depth in other units that are common."""
     along = "Depth is the distance along the ray: divide it by the length of K^-1 (x, y, 1), which makes it camera z."
-    found = Candidate("depth along the ray", "along the ray", along, asis._replace(along_ray=True))
-    return [found, *(depth_scaled(asis, scale) for scale in (*UNITS, *(1 / unit for unit in UNITS)))]
+    found = Candidate("depth along the ray", "along the ray", along, stated._replace(along_ray=True))
+    return [found, *(depth_scaled(stated, scale) for scale in (*UNITS, *(1 / unit for unit in UNITS)))]
 
 
-def _both(asis: Hypothesis, change: Callable[[Geometry], Geometry]) -> Hypothesis:
-    photographs = change(asis.photographs)
-    beside = photographs if asis.beside is asis.photographs else change(asis.beside)
-    return asis._replace(photographs=photographs, beside=beside)
+def _both(stated: Hypothesis, change: Callable[[Geometry], Geometry]) -> Hypothesis:
+    photographs = change(stated.photographs)
+    beside = photographs if stated.beside is stated.photographs else change(stated.beside)
+    return stated._replace(photographs=photographs, beside=beside)
 
 
 def _inverted(cameras: Geometry) -> Geometry:

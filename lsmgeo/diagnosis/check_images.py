@@ -9,25 +9,25 @@ import numpy as np
 from lsmgeo.data import PosedImages
 from lsmgeo.data.posed import Voxels
 from lsmgeo.diagnosis.evidence import Evidence, Features, Points, gather_evidence, pair_medians
-from lsmgeo.diagnosis.explain import explain, invisible_mistakes, is_suspicious
-from lsmgeo.diagnosis.facts import describe_scene, find_gap, implausibilities
 from lsmgeo.diagnosis.feature_matching import choose_views
-from lsmgeo.diagnosis.findings import LIMITS, Cause, Check, Findings, badness, share, tell
-from lsmgeo.diagnosis.geometry import Hypothesis, as_they_are
+from lsmgeo.diagnosis.find_cause import explain, invisible_errors, is_suspicious
+from lsmgeo.diagnosis.findings import LIMITS, Cause, Check, Findings, badness, format_value, share
 from lsmgeo.diagnosis.half_pixel import Shift, find_shifts, is_certain, is_half_a_pixel, is_large, nearer_half
 from lsmgeo.diagnosis.residuals import reprojection_errors, sampson_distances
+from lsmgeo.diagnosis.scene_summary import describe_scene, find_gap, implausibilities
+from lsmgeo.diagnosis.two_view_geometry import Hypothesis, stated_hypothesis
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
     from typing import Any
 
-    from lsmgeo.diagnosis.explain import Explanation
+    from lsmgeo.diagnosis.find_cause import Explanation
 
-__all__ = ["Examination", "examine", "examine_photographs"]
+__all__ = ["Examination", "examine", "examine_images"]
 
 # Of the views, at most this fraction may be off for the others to be believed.
-MOST_OFF = 1 / 3
+MOST_OUTLIERS = 1 / 3
 LISTED = 5
 SHUFFLED = "frames shuffled"
 # A measurement of right cameras stays this far below its limit, as a multiple of it.
@@ -57,17 +57,17 @@ def examine(content: Any, path: Path) -> Findings:
         DataError: a file that is needed is missing or damaged.
     """
     if isinstance(content, PosedImages):
-        return examine_photographs(content).findings
+        return examine_images(content).findings
     if isinstance(content, Voxels):
-        from lsmgeo.diagnosis.check_solids import examine_voxels
+        from lsmgeo.diagnosis.check_voxels import examine_voxels
 
         return examine_voxels(content, path)
-    from lsmgeo.diagnosis.boards import examine_calibration
+    from lsmgeo.diagnosis.check_calibration import examine_calibration
 
     return examine_calibration(content, path)
 
 
-def examine_photographs(scene: PosedImages) -> Examination:
+def examine_images(scene: PosedImages) -> Examination:
     """Measure whether cameras, photographs and what came with them belong together, and find the mistake if not.
 
     Of more than 40 photographs, runs of successive ones are looked at, always the same.
@@ -83,22 +83,22 @@ def examine_photographs(scene: PosedImages) -> Examination:
     """
     sizes = np.array([scene.size(view) for view in range(len(scene))])
     views = choose_views(len(scene))
-    asis = as_they_are(scene)
-    evidence = gather_evidence(scene, views, sizes, asis)
-    checks = [check for item in evidence for check in item.measure_all(asis)]
+    stated = stated_hypothesis(scene)
+    evidence = gather_evidence(scene, views, sizes, stated)
+    checks = [check for item in evidence for check in item.measure_all(stated)]
     tried: tuple[str, ...] = ()
-    cause, remarks = None, implausibilities(asis.photographs, sizes)
+    cause, remarks = None, implausibilities(stated.photographs, sizes)
     passed = all(check.passed for check in checks)
-    with_views, off = _with_views(scene, checks, evidence, asis)
+    with_views, off = _check_single_views(scene, checks, evidence, stated)
     if is_suspicious(checks):
-        explanation, tried = explain(asis, evidence, scene.names, sizes, views)
+        explanation, tried = explain(stated, evidence, scene.names, sizes, views)
         if explanation is not None and (off is None or _beats_single_views(explanation, passed=passed)):
-            cause = _told(explanation)
+            cause = _explained_cause(explanation)
     if cause is None:
-        shifts = find_shifts(evidence, asis.photographs)
-        half, mended = _half_a_pixel(shifts, asis)
+        shifts = find_shifts(evidence, stated.photographs)
+        half, mended = _half_a_pixel(shifts, stated)
         # Half a pixel may put one view beyond what is allowed first; without it no view is off.
-        if half is not None and (off is None or _with_views(scene, checks, evidence, mended)[1] is None):
+        if half is not None and (off is None or _check_single_views(scene, checks, evidence, mended)[1] is None):
             checks, cause = (with_views if off is None else checks), half
         else:
             checks, cause = with_views, off
@@ -108,16 +108,16 @@ def examine_photographs(scene: PosedImages) -> Examination:
             remarks.append("half a pixel more or less could not be seen in this data")
         if cause is None and passed:
             remarks += [
-                f"the {shift.told_by} agree best with principal points moved by {-shift.x:+.1f}, {-shift.y:+.1f} px"
+                f"the {shift.source} agree best with principal points moved by {-shift.x:+.1f}, {-shift.y:+.1f} px"
                 for shift in shifts
                 if is_large(shift)
             ]
-    if cause is None and passed and checks and (hidden := invisible_mistakes(asis, evidence, sizes)):
+    if cause is None and passed and checks and (hidden := invisible_errors(stated, evidence, sizes)):
         remarks.append(f"these mistakes would leave no trace in this data: {', '.join(hidden)}")
-    facts = describe_scene(scene, views, evidence, asis, sizes)
+    facts = describe_scene(scene, views, evidence, stated, sizes)
     gap = None if checks or cause is not None else find_gap(scene)
     findings = Findings(tuple(facts), tuple(checks), cause, tuple(remarks), gap=gap)
-    return Examination(findings, tuple(evidence), asis)
+    return Examination(findings, tuple(evidence), stated)
 
 
 def _beats_single_views(explanation: Explanation, *, passed: bool) -> bool:
@@ -129,7 +129,7 @@ def _beats_single_views(explanation: Explanation, *, passed: bool) -> bool:
     return not passed
 
 
-def _told(explanation: Explanation) -> Cause:
+def _explained_cause(explanation: Explanation) -> Cause:
     """In words: the checks that the correction improves most."""
     candidate, before, after, rivals = explanation
     gains = [badness(old) / badness(new) for old, new in zip(before, after, strict=True)]
@@ -137,26 +137,30 @@ def _told(explanation: Explanation) -> Cause:
     for index in np.argsort(gains)[::-1][:2].tolist():
         if gains[index] > 1.5:
             old, new = before[index], after[index]
-            parts.append(f"{old.name}: {tell(new.value)} instead of {tell(old.value)} {old.unit}".rstrip())
+            parts.append(
+                f"{old.name}: {format_value(new.value)} instead of {format_value(old.value)} {old.unit}".rstrip()
+            )
     evidence = f"{candidate.corrected}, {'; '.join(parts)}"
     if rivals:
         evidence += f" (this data cannot tell it from: {', '.join(rivals)})"
     return Cause(candidate.name, evidence, candidate.remedy)
 
 
-def _half_a_pixel(shifts: Sequence[Shift], asis: Hypothesis) -> tuple[Cause | None, Hypothesis]:
+def _half_a_pixel(shifts: Sequence[Shift], stated: Hypothesis) -> tuple[Cause | None, Hypothesis]:
     """Half a pixel where most of what is certain tells it, and the cameras without it."""
     told = [shift for shift in shifts if is_half_a_pixel(shift)]
     # Evidence that is as certain and says otherwise speaks against it.
     against = [shift for shift in shifts if is_certain(shift) and not is_half_a_pixel(shift)]
     if len(told) <= len(against):
-        return None, asis
+        return None, stated
     best = min(told, key=lambda shift: max(shift.error_x, shift.error_y))
     step = nearer_half(best)
     large, sign = step > 0, np.sign(step)
-    mended = asis._replace(photographs=asis.photographs.shifted(-step, -step), beside=asis.beside.shifted(-step, -step))
+    mended = stated._replace(
+        photographs=stated.photographs.shifted(-step, -step), beside=stated.beside.shifted(-step, -step)
+    )
     evidence = (
-        f"the {best.told_by} put the principal points {best.x * sign:.2f} +- {best.error_x:.2f} px (x) and "
+        f"the {best.source} put the principal points {best.x * sign:.2f} +- {best.error_x:.2f} px (x) and "
         f"{best.y * sign:.2f} +- {best.error_y:.2f} px (y) too {'far' if large else 'near'}"
     )
     remedy = (
@@ -167,14 +171,14 @@ def _half_a_pixel(shifts: Sequence[Shift], asis: Hypothesis) -> tuple[Cause | No
     return Cause("half a pixel", evidence, remedy), mended
 
 
-def _with_views(
-    scene: PosedImages, checks: list[Check], evidence: Sequence[Evidence], asis: Hypothesis
+def _check_single_views(
+    scene: PosedImages, checks: list[Check], evidence: Sequence[Evidence], stated: Hypothesis
 ) -> tuple[list[Check], Cause | None]:
     """Add a check of single views, where all others agree; a view that does not is a cause of its own."""
-    found = [_off_by_features(item, asis) for item in evidence if isinstance(item, Features)]
-    found += [_off_by_points(item, asis) for item in evidence if isinstance(item, Points)]
+    found = [_outliers_by_features(item, stated) for item in evidence if isinstance(item, Features)]
+    found += [_outliers_by_points(item, stated) for item in evidence if isinstance(item, Points)]
     off, judged = (set().union(*views) for views in zip((set(), set()), *found, strict=True))
-    if not judged or len(off) > MOST_OFF * len(judged):
+    if not judged or len(off) > MOST_OUTLIERS * len(judged):
         return checks, None
     agree = 1 - len(off) / len(judged)
     checks = [*checks, share("photographs that agree with the others", agree, "views", len(judged), "photographs")]
@@ -186,14 +190,14 @@ def _with_views(
     return checks, Cause("some views are off", evidence_text, "Leave these photographs out, or find their poses again.")
 
 
-def _off_by_features(features: Features, asis: Hypothesis) -> tuple[set[int], set[int]]:
+def _outliers_by_features(features: Features, stated: Hypothesis) -> tuple[set[int], set[int]]:
     """Views all of whose pairs are bad, taken away one by one until the others agree."""
     first, second = features.matches.first, features.matches.second
-    medians = pair_medians(np.abs(sampson_distances(features.matches, asis.photographs)), features.matches)
+    medians = pair_medians(np.abs(sampson_distances(features.matches, stated.photographs)), features.matches)
     # Where most pairs are bad, no single view is.
     if not np.median(medians) <= features.limit:
         return set(), set()
-    bad = medians > _standing_out(medians, features.limit)
+    bad = medians > _outlier_limit(medians, features.limit)
     left = np.ones(len(first), bool)
     off: set[int] = set()
     while (bad & left).any():
@@ -212,15 +216,15 @@ def _off_by_features(features: Features, asis: Hypothesis) -> tuple[set[int], se
     return off, set(np.flatnonzero(counts >= LEAST_PAIRS).tolist())
 
 
-def _standing_out(medians: np.ndarray, limit: float) -> float:
+def _outlier_limit(medians: np.ndarray, limit: float) -> float:
     """From where on a view or a pair is worse than its fellows: what all share is no single view's."""
     return float(np.clip(LIMITS["view"] * np.median(medians), limit, LIMITS["view"] * limit))
 
 
-def _off_by_points(points: Points, asis: Hypothesis) -> tuple[set[int], set[int]]:
-    errors, _, views = reprojection_errors(points.points, asis.beside)
+def _outliers_by_points(points: Points, stated: Hypothesis) -> tuple[set[int], set[int]]:
+    errors, _, views = reprojection_errors(points.points, stated.beside)
     known = np.flatnonzero(np.bincount(views) >= LEAST_OBSERVED)
     medians = np.array([np.median(errors[views == view]) for view in known])
     if not len(known) or not np.median(medians) <= points.limit:
         return set(), set()
-    return set(known[medians > _standing_out(medians, points.limit)].tolist()), set(known.tolist())
+    return set(known[medians > _outlier_limit(medians, points.limit)].tolist()), set(known.tolist())

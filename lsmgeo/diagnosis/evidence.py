@@ -7,16 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lsmgeo.diagnosis.check_silhouettes import (
-    epipolar_tangency,
-    load_silhouettes,
-    near_cells,
-    occupied_centers,
-    outline,
-    overlap,
-    within_a_cell,
-)
-from lsmgeo.diagnosis.check_surfaces import (
+from lsmgeo.diagnosis.depth_consistency import (
     Surfaces,
     load_surfaces,
     relative_errors,
@@ -24,37 +15,36 @@ from lsmgeo.diagnosis.check_surfaces import (
     thinned,
     warp_errors,
 )
-from lsmgeo.diagnosis.feature_matching import Matches, grey_picture, match_features
+from lsmgeo.diagnosis.feature_matching import Matches, grey_image, match_features
 from lsmgeo.diagnosis.findings import CENTRED, LIMITS, SIDES, Check, pixel_limit, share
-from lsmgeo.diagnosis.geometry import evenly
 from lsmgeo.diagnosis.residuals import in_front, reprojection_errors, sampson_distances
+from lsmgeo.diagnosis.silhouette_consistency import (
+    epipolar_tangency,
+    load_masks,
+    near_cells,
+    occupied_cells,
+    outline,
+    overlap,
+    within_a_cell,
+)
+from lsmgeo.diagnosis.two_view_geometry import evenly
 
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
-    from lsmgeo.diagnosis.geometry import Geometry, Hypothesis
+    from lsmgeo.diagnosis.two_view_geometry import Geometry, Hypothesis
 
 __all__ = [
-    "Centres",
-    "DepthMaps",
-    "Evidence",
-    "Features",
-    "Outlines",
-    "Points",
-    "Solids",
-    "StereoPair",
-    "gather_evidence",
-    "is_rectified",
-    "pair_medians",
-    "principal_offsets",
-]
+    "DepthMaps", "Evidence", "Features", "Points", "PrincipalPoints", "Silhouettes", "StereoPair", "VoxelModel",
+    "gather_evidence", "is_rectified", "pair_medians", "principal_offsets",
+]  # fmt: skip
 
 LEAST_WITH_PARALLAX = 30
 LEAST_OBSERVATIONS = 20
-LEAST_OUTLINE_PAIRS = 3
+LEAST_SILHOUETTE_PAIRS = 3
 LEAST_PAIRS = 3
 # Matches of a pair, and pairs of outlines, that a hypothesis is tried on.
 MATCHES_TRIED = 100
-OUTLINE_PAIRS, OUTLINE_PAIRS_TRIED = 300, 60
+SILHOUETTE_PAIRS, SILHOUETTE_PAIRS_TRIED = 300, 60
 PIXELS_TRIED, VIEWS_TRIED = 400, 12
 
 
@@ -160,7 +150,7 @@ class StereoPair(Evidence):
 
     def __init__(self, scene: PosedImages) -> None:
         self.surfaces = load_surfaces(scene, np.arange(2))
-        self.pictures = tuple(grey_picture(scene, view, max(scene.size(view)))[0] for view in range(2))
+        self.pictures = tuple(grey_image(scene, view, max(scene.size(view)))[0] for view in range(2))
         self.measurable = len(self.surfaces.views) > 0
 
     def _measured(self, hypothesis: Hypothesis, _: Any) -> list[Check]:
@@ -173,19 +163,19 @@ class StereoPair(Evidence):
         return [Check("picture warped by depth", value, "grey levels", max(limit, 1.0), len(moved), "pixels")]
 
 
-class Outlines(Evidence):
-    """Outlines of cut-out photographs: planes through the baseline touch them in both views."""
+class Silhouettes(Evidence):
+    """Silhouettes of cut-out photographs: planes through the baseline touch them in both views."""
 
     def __init__(self, scene: PosedImages, views: np.ndarray, sizes: np.ndarray) -> None:
         masks = ((view, scene.load_mask(view)) for view in views.tolist())
         contours = ((view, None if mask is None else outline(mask.numpy())) for view, mask in masks)
         self.outlines = {view: contour for view, contour in contours if contour is not None}
         pairs = list(itertools.combinations(sorted(self.outlines), 2))
-        self.pairs = self.everything = [pairs[index] for index in evenly(len(pairs), OUTLINE_PAIRS)]
-        self.tried = [self.pairs[index] for index in evenly(len(self.pairs), OUTLINE_PAIRS_TRIED)]
+        self.pairs = self.everything = [pairs[index] for index in evenly(len(pairs), SILHOUETTE_PAIRS)]
+        self.tried = [self.pairs[index] for index in evenly(len(self.pairs), SILHOUETTE_PAIRS_TRIED)]
         self.limit = pixel_limit(sizes)
         # The two tangents of a single pair agree too often by chance.
-        self.measurable = len(self.pairs) >= LEAST_OUTLINE_PAIRS
+        self.measurable = len(self.pairs) >= LEAST_SILHOUETTE_PAIRS
 
     def _measured(self, hypothesis: Hypothesis, pairs: list[tuple[int, int]]) -> list[Check]:
         distances = self.distances(hypothesis.photographs, pairs)
@@ -203,7 +193,7 @@ class Outlines(Evidence):
         return epipolar_tangency(self.outlines[first], self.outlines[second], both)
 
 
-class Solids(Evidence):
+class VoxelModel(Evidence):
     """The solid that photographs show: it projects into the outlines, and depth lies on it."""
 
     slow = True
@@ -211,8 +201,8 @@ class Solids(Evidence):
     def __init__(self, scene: PosedImages, views: np.ndarray) -> None:
         assert scene.voxels is not None
         self.near, self.lattice = near_cells(scene.voxels)
-        self.solid = occupied_centers(scene.voxels)
-        self.silhouettes = load_silhouettes(scene, views) if scene.cut_out else None
+        self.solid = occupied_cells(scene.voxels)
+        self.silhouettes = load_masks(scene, views) if scene.cut_out else None
         surfaces = load_surfaces(scene, views) if scene.depths is not None else None
         self.surfaces = surfaces if surfaces is not None and surfaces.views else None
         self.measurable = len(self.solid.centers) > 0 and (self.silhouettes or self.surfaces) is not None
@@ -233,7 +223,7 @@ class Solids(Evidence):
         return checks
 
 
-class Centres(Evidence):
+class PrincipalPoints(Evidence):
     """Principal points: near the middle of the picture where nothing else tells whether K belongs to its size."""
 
     def __init__(self, sizes: np.ndarray) -> None:
@@ -263,7 +253,7 @@ def is_rectified(cameras: Geometry) -> bool:
     )
 
 
-def gather_evidence(scene: PosedImages, views: np.ndarray, sizes: np.ndarray, asis: Hypothesis) -> list[Evidence]:
+def gather_evidence(scene: PosedImages, views: np.ndarray, sizes: np.ndarray, stated: Hypothesis) -> list[Evidence]:
     """All that can be measured about a scene.
 
     Raises:
@@ -271,18 +261,18 @@ def gather_evidence(scene: PosedImages, views: np.ndarray, sizes: np.ndarray, as
     """
     candidates: list[Evidence] = []
     if len(scene) >= 2:
-        candidates.append(Features(scene, views, sizes, asis.photographs))
+        candidates.append(Features(scene, views, sizes, stated.photographs))
     if scene.points is not None:
         candidates.append(Points(scene, sizes))
     if scene.cut_out and len(scene) >= 2:
-        candidates.append(Outlines(scene, views, sizes))
+        candidates.append(Silhouettes(scene, views, sizes))
     if scene.depths is not None:
-        if is_rectified(asis.photographs):
+        if is_rectified(stated.photographs):
             candidates.append(StereoPair(scene))
         else:
             candidates.append(DepthMaps(scene, views))
     if scene.voxels is not None:
-        candidates.append(Solids(scene, views))
+        candidates.append(VoxelModel(scene, views))
     found = [evidence for evidence in candidates if evidence.measurable]
     # A rectified pair's rows stay its rows whatever K is.
-    return [*found, Centres(sizes)] if found and is_rectified(asis.photographs) else found
+    return [*found, PrincipalPoints(sizes)] if found and is_rectified(stated.photographs) else found

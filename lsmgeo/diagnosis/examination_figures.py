@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lsmgeo.diagnosis.camera_drawing import Content, draw_cameras, surface_of
-from lsmgeo.diagnosis.check_silhouettes import draw_solid
-from lsmgeo.diagnosis.check_surfaces import seen_errors, surface_points, warped
-from lsmgeo.diagnosis.evidence import DepthMaps, Features, Solids, StereoPair, pair_medians
+from lsmgeo.diagnosis.depth_consistency import best_neighbour_errors, surface_points, warp_view
+from lsmgeo.diagnosis.evidence import DepthMaps, Features, StereoPair, VoxelModel, pair_medians
 from lsmgeo.diagnosis.feature_matching import shrunk
-from lsmgeo.diagnosis.geometry import evenly, fundamental, homogeneous
 from lsmgeo.diagnosis.residuals import sampson_distances
+from lsmgeo.diagnosis.silhouette_consistency import draw_cells
+from lsmgeo.diagnosis.two_view_geometry import evenly, fundamental, homogeneous
 from lsmgeo.drawing import as_pixels, as_png, new_figure
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def draw_examination(scene: PosedImages, examination: Examination, title: str) -
             pictures["depth of a view in another"] = ("depth.png", _depth(scene, examination, item, title))
         elif isinstance(item, StereoPair):
             pictures["pair warped by depth"] = ("warp.png", _warp(examination, item, title))
-        elif isinstance(item, Solids) and item.silhouettes is not None:
+        elif isinstance(item, VoxelModel) and item.silhouettes is not None:
             pictures["voxels in the outlines"] = ("outlines.png", _outlines(scene, examination, item, title))
     return pictures
 
@@ -144,7 +144,7 @@ def _dots(axes: Axes, pixels: np.ndarray, values: np.ndarray, label: str, **opti
 
 def _depth(scene: PosedImages, examination: Examination, item: DepthMaps, title: str) -> bytes:
     """A typical view's depth, and how far the depth of its best neighbour is from it where both are known."""
-    found = seen_errors(item.surfaces, examination.hypothesis)
+    found = best_neighbour_errors(item.surfaces, examination.hypothesis)
     figure = new_figure(14, 5.2, title, dpi=DPI)
     left, right = figure.subplots(1, 2)
     if found:
@@ -175,7 +175,7 @@ def _warp(examination: Examination, item: StereoPair, title: str) -> bytes:
     figure = new_figure(14, 5.2, title, dpi=DPI)
     left, right = figure.subplots(1, 2)
     height, width = item.pictures[view].shape
-    pixels, moved, unmoved = warped(item.surfaces, examination.hypothesis, item.pictures, view)
+    pixels, moved, unmoved = warp_view(item.surfaces, examination.hypothesis, item.pictures, view)
     for axes, values, words in ((left, unmoved, "as they are"), (right, moved, "warped by depth")):
         _show(axes, item.pictures[view], 1.0, cmap="gray", alpha=0.5)
         _dots(axes, pixels, values, "grey levels", cmap="turbo", vmin=0, vmax=60)
@@ -186,7 +186,7 @@ def _warp(examination: Examination, item: StereoPair, title: str) -> bytes:
     return as_png(figure)
 
 
-def _outlines(scene: PosedImages, examination: Examination, item: Solids, title: str) -> bytes:
+def _outlines(scene: PosedImages, examination: Examination, item: VoxelModel, title: str) -> bytes:
     """Photographs with the border of the projected voxels, up to eight views."""
     assert item.silhouettes is not None
     rows = evenly(len(item.silhouettes.views), 8).tolist()
@@ -199,7 +199,7 @@ def _outlines(scene: PosedImages, examination: Examination, item: Solids, title:
     for axes, row in zip(grid, rows, strict=False):
         view, mask, step = (values[row] for values in item.silhouettes)
         _show(axes, *_shown(scene, view))
-        drawn = draw_solid(item.solid, examination.hypothesis.photographs, view, mask.shape, step)
+        drawn = draw_cells(item.solid, examination.hypothesis.photographs, view, mask.shape, step)
         x, y = np.arange(mask.shape[1]) * step, np.arange(mask.shape[0]) * step
         for borders, colour in ((mask, "tab:green"), (drawn, "tab:red")):
             if borders.any() and not borders.all():

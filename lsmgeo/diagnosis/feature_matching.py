@@ -11,7 +11,7 @@ from tqdm import tqdm
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
 
-__all__ = ["MAX_VIEWS", "Matches", "choose_views", "count_features", "grey_picture", "match_features", "shrunk"]
+__all__ = ["MAX_VIEWS", "Matches", "choose_views", "count_features", "grey_image", "match_features", "shrunk"]
 
 # Views that are looked at, at most; beyond, runs of neighbours are taken so that some of them overlap.
 MAX_VIEWS = 40
@@ -64,7 +64,7 @@ def choose_views(count: int) -> np.ndarray:
     return np.unique(starts[:, None] + np.arange(RUN))
 
 
-def grey_picture(scene: PosedImages, view: int, longest: int) -> tuple[np.ndarray, np.ndarray]:
+def grey_image(scene: PosedImages, view: int, longest: int) -> tuple[np.ndarray, np.ndarray]:
     """One photograph in grey, shrunk where its longer side is beyond ``longest``.
 
     Returns:
@@ -102,7 +102,7 @@ def match_features(scene: PosedImages, views: np.ndarray) -> Matches:
     found = {}
     longest = LONGEST_SIDE if len(views) <= MANY else LONGEST_SIDE_OF_MANY
     for view in tqdm(views.tolist(), desc="features", unit="photograph", disable=None, leave=False):
-        found[view] = _features(*grey_picture(scene, view, longest))
+        found[view] = _features(*grey_image(scene, view, longest))
     pairs = []
     for first, second in tqdm(_promising_pairs(found), desc="matches", unit="pair", disable=None, leave=False):
         pixels = _verified(found[first], found[second])
@@ -123,7 +123,7 @@ def count_features(scene: PosedImages, views: np.ndarray) -> np.ndarray:
     Raises:
         DataError: a photograph is missing, damaged or not of its camera's size.
     """
-    return np.array([len(_features(*grey_picture(scene, view, LONGEST_SIDE)).pixels) for view in views.tolist()], int)
+    return np.array([len(_features(*grey_image(scene, view, LONGEST_SIDE)).pixels) for view in views.tolist()], int)
 
 
 class _Features(NamedTuple):
@@ -147,7 +147,7 @@ def _features(grey: np.ndarray, zoom: np.ndarray) -> _Features:
     return _Features((pixels[order] + 0.5) * zoom - 0.5, torch.from_numpy(words[order]), zoom)
 
 
-def _mutual(first: torch.Tensor, second: torch.Tensor, ratio: float) -> tuple[np.ndarray, np.ndarray]:
+def _mutual_matches(first: torch.Tensor, second: torch.Tensor, ratio: float) -> tuple[np.ndarray, np.ndarray]:
     """Rows of two sets of words that are each other's nearest, clearly nearer than the next: (M,) and (M,)."""
     if min(len(first), len(second)) < 2:
         return np.zeros(0, int), np.zeros(0, int)
@@ -166,7 +166,7 @@ def _promising_pairs(found: dict[int, _Features]) -> list[tuple[int, int]]:
     shared = np.zeros((len(views), len(views)), int)
     for i, first in enumerate(tqdm(views, desc="pairs", unit="photograph", disable=None, leave=False)):
         for j, second in enumerate(views[:i]):
-            shared[i, j] = shared[j, i] = len(_mutual(strong[first], strong[second], RATIO_AT_FIRST)[0])
+            shared[i, j] = shared[j, i] = len(_mutual_matches(strong[first], strong[second], RATIO_AT_FIRST)[0])
     pairs = set()
     for i, row in enumerate(shared):
         for j in np.argsort(-row, kind="stable")[:PARTNERS]:
@@ -179,7 +179,7 @@ def _verified(first: _Features, second: _Features) -> np.ndarray | None:
     """(M, 2, 2) pixels of the matches that fit one fundamental matrix; None where too few do."""
     import cv2
 
-    rows, columns = _mutual(first.words, second.words, RATIO)
+    rows, columns = _mutual_matches(first.words, second.words, RATIO)
     if len(rows) < LEAST_VERIFIED:
         return None
     pixels = np.stack([first.pixels[rows], second.pixels[columns]], 1)

@@ -7,8 +7,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 __all__ = [
-    "CENTRED", "LIMITS", "SIDES", "Cause", "Check", "Findings", "Gap", "badness", "counted", "pixel_limit", "report",
-    "share", "tell",
+    "CENTRED", "LIMITS", "SIDES", "Cause", "Check", "Findings", "Gap", "badness", "counted", "format_value",
+    "pixel_limit", "report", "share",
 ]  # fmt: skip
 
 # Good sets stay at a quarter of these or below; the mistakes that people make go beyond by ten times and more.
@@ -176,7 +176,7 @@ def _concluded(findings: Findings) -> list[tuple[str, str]]:
 def _line(check: Check) -> str:
     sign = ">=" if check.at_least else "<="
     unit = {"grey levels": "grey"}.get(check.unit, check.unit)
-    value, limit = (f"{tell(number)} {unit}".rstrip() for number in (check.value, check.limit))
+    value, limit = (f"{format_value(number)} {unit}".rstrip() for number in (check.value, check.limit))
     state = "ok" if check.passed else "FAILED"
     return f"{check.name:<42}{value:>9}  {sign} {limit:>8}  {state:<7} {counted(check.measured, check.of)}".rstrip()
 
@@ -194,12 +194,12 @@ def counted(count: int, things: str) -> str:
     return f"{count} {things}"
 
 
-def tell(value: float) -> str:
+def format_value(value: float) -> str:
     """A measurement in three digits; what is beyond measure in words.
 
     Example:
-        >>> from lsmgeo.diagnosis.findings import tell
-        >>> tell(0.16472), tell(99.96), tell(float("inf"))
+        >>> from lsmgeo.diagnosis.findings import format_value
+        >>> format_value(0.16472), format_value(99.96), format_value(float("inf"))
         ('0.165', '99.96', 'infinite')
     """
     if np.isnan(value):

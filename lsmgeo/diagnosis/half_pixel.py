@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.evidence import Features, Outlines, Points
+from lsmgeo.diagnosis.evidence import Features, Points, Silhouettes
 from lsmgeo.diagnosis.residuals import reprojections, residuals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from lsmgeo.diagnosis.evidence import Evidence
-    from lsmgeo.diagnosis.geometry import Geometry
+    from lsmgeo.diagnosis.two_view_geometry import Geometry
 
 __all__ = ["Shift", "find_shifts", "is_certain", "is_half_a_pixel", "is_large", "nearer_half"]
 
@@ -38,14 +38,14 @@ class Shift(NamedTuple):
     """By how much all principal points seem to be too large, in px.
 
     Attributes:
-        told_by: what was looked at.
+        source: what was looked at.
         x: along x.
         y: along y.
         error_x: standard error of x.
         error_y: standard error of y.
     """
 
-    told_by: str
+    source: str
     x: float
     y: float
     error_x: float
@@ -62,9 +62,9 @@ def find_shifts(evidence: Sequence[Evidence], cameras: Geometry) -> list[Shift]:
             steps = np.stack([residuals(item.matches, cameras.shifted(*step)) for step in _STEPS])
             views = np.stack([item.matches.first, item.matches.second], 1)
             pair = np.repeat(item.matches.pair, 2)
-            found.append(_fitted("matched features", steps.reshape(len(steps), -1), pair, views))
-        elif isinstance(item, Outlines):
-            found.append(_shift_of_outlines(item, cameras))
+            found.append(_robust_shift("matched features", steps.reshape(len(steps), -1), pair, views))
+        elif isinstance(item, Silhouettes):
+            found.append(_shift_of_silhouettes(item, cameras))
     return [shift for shift in found if shift is not None]
 
 
@@ -127,7 +127,7 @@ def _shift_of_points(points: Points, cameras: Geometry) -> Shift | None:
     return Shift("sparse points", *(float(value) for value in (*mean, *errors)))
 
 
-def _shift_of_outlines(outlines: Outlines, cameras: Geometry) -> Shift | None:
+def _shift_of_silhouettes(outlines: Silhouettes, cameras: Geometry) -> Shift | None:
     """Where along the diagonal the tangents' squared distances are least, which have no sign to be followed."""
     views = np.array(outlines.pairs)
     if len(outlines.outlines) < LEAST_VIEWS:
@@ -148,21 +148,21 @@ def _shift_of_outlines(outlines: Outlines, cameras: Geometry) -> Shift | None:
 
     best = lowest(np.ones(len(views), bool))
     without = np.array([lowest((views != view).all(1)) for view in sorted(outlines.outlines)])
-    error = _left_out(without[:, None])[0]
+    error = _jackknife_errors(without[:, None])[0]
     return Shift("outlines", best, best, float(error), float(error))
 
 
-def _left_out(without: np.ndarray) -> np.ndarray:
+def _jackknife_errors(without: np.ndarray) -> np.ndarray:
     """Standard errors from estimates (V, K) without one view each: pairs of one view share its errors."""
     spread = without - without.mean(0)
     return np.asarray(np.sqrt((len(without) - 1) / len(without) * (spread**2).sum(0)) + 1e-6)
 
 
-def _fitted(told_by: str, found: np.ndarray, pair: np.ndarray, views: np.ndarray) -> Shift | None:
+def _robust_shift(source: str, found: np.ndarray, pair: np.ndarray, views: np.ndarray) -> Shift | None:
     """The shift that makes signed residuals least, with robust weights; its errors by leaving out views.
 
     Args:
-        told_by: what the residuals are of.
+        source: what the residuals are of.
         found: (5, M) residuals at no shift and at the steps along +x, -x, +y, -y.
         pair: (M,) which pair of views each one is of.
         views: (P, 2) the views of each pair.
@@ -192,6 +192,6 @@ def _fitted(told_by: str, found: np.ndarray, pair: np.ndarray, views: np.ndarray
         if np.linalg.cond(normals[kept].sum(0)) > 1e8:
             return None
         without.append(np.linalg.solve(normals[kept].sum(0), rights[kept].sum(0)))
-    errors = _left_out(np.array(without))
+    errors = _jackknife_errors(np.array(without))
     # Residuals vanish at cameras shifted by ``shift``: as they are, they are too large by its opposite.
-    return Shift(told_by, *(float(value) for value in (*-shift, *errors)))
+    return Shift(source, *(float(value) for value in (*-shift, *errors)))

@@ -9,67 +9,67 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lsmgeo.diagnosis.camera_errors import Candidate
-from lsmgeo.diagnosis.check_silhouettes import draw_solid, intersection_over_union
-from lsmgeo.diagnosis.evidence import Features, Outlines, Points, Solids, is_rectified
+from lsmgeo.diagnosis.evidence import Features, Points, Silhouettes, VoxelModel, is_rectified
 from lsmgeo.diagnosis.findings import counted
 from lsmgeo.diagnosis.residuals import pair_distances, view_costs
+from lsmgeo.diagnosis.silhouette_consistency import draw_cells, intersection_over_union
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from lsmgeo.diagnosis.evidence import Evidence
-    from lsmgeo.diagnosis.geometry import Geometry, Hypothesis
+    from lsmgeo.diagnosis.two_view_geometry import Geometry, Hypothesis
 
-__all__ = ["assigned", "named_orders", "order_mistakes", "search_order"]
+__all__ = ["assign_cameras", "named_permutations", "permutation_candidates", "search_permutation"]
 
 # Costs saturate at so many limits: a wrong pair of cameras is wrong, whether by ten pixels or by a hundred.
 WORST = 4.0
 SEEDS_PER_PAIR, SEEDED_PAIRS, ROUNDS, LEAST_GAIN = 40, 4, 4, 1e-12
 MATCHES_TRIED = 40
-# Outlines are compared one by one: only few views bear all their pairs under all pairs of cameras.
-MOST_OUTLINES = 16
+# Silhouettes are compared one by one: only few views bear all their pairs under all pairs of cameras.
+MOST_SILHOUETTES = 16
 LISTED = 4
 
 
-def order_mistakes(
-    asis: Hypothesis, names: Sequence[str], evidence: Sequence[Evidence], views: np.ndarray
+def permutation_candidates(
+    stated: Hypothesis, names: Sequence[str], evidence: Sequence[Evidence], views: np.ndarray
 ) -> list[Candidate]:
     """Candidates in which photographs are beside other cameras: orders that have names, and those told from evidence.
 
     Args:
-        asis: the cameras as they are.
+        stated: the cameras as they are.
         names: the photographs' names.
         evidence: what is known.
         views: the views that were looked at.
     """
     count = len(names)
-    orders = [*named_orders(names), *((order, "") for order in _told_orders(asis, evidence, views))]
+    orders = [*named_permutations(names), *((order, "") for order in _fitted_permutations(stated, evidence, views))]
     found, seen = [], {tuple(range(count))}
     for order, words in orders:
         if tuple(order) in seen:
             continue
         seen.add(tuple(order))
         name, remedy = "frames shuffled", _remedy(order, names, words)
-        if is_rectified(asis.photographs):
+        if is_rectified(stated.photographs):
             name, remedy = "left and right exchanged", "The two photographs are exchanged: the first is the right one."
         corrected = f"with {words}" if words else "with the photographs at the cameras that fit them"
-        photographs = asis.photographs.taken(order)
-        alone = asis._replace(photographs=photographs)
+        photographs = stated.photographs.taken(order)
+        alone = stated._replace(photographs=photographs)
         # Depth and points may have gone with the photographs, or stayed with the cameras.
-        changed = [alone._replace(beside=asis.beside.taken(order)), alone]
-        if np.ptp(asis.photographs.K, axis=0).any():
+        changed = [alone._replace(beside=stated.beside.taken(order)), alone]
+        if np.ptp(stated.photographs.K, axis=0).any():
             # Or every photograph has kept its own K, and the poses alone are in another order.
-            changed.append(asis._replace(photographs=photographs._replace(K=asis.photographs.K)))
+            changed.append(stated._replace(photographs=photographs._replace(K=stated.photographs.K)))
         found += [Candidate(name, corrected, remedy, hypothesis) for hypothesis in changed]
     return found
 
 
-def named_orders(names: Sequence[str]) -> list[tuple[np.ndarray, str]]:
+def named_permutations(names: Sequence[str]) -> list[tuple[np.ndarray, str]]:
     """Orders that come of usual slips: (V,) the camera of each photograph, and what to call it.
 
     Example:
-        >>> from lsmgeo.diagnosis.permutations import named_orders
-        >>> order, words = named_orders(["frame_0", "frame_1", "frame_10", "frame_2"])[0]
+        >>> from lsmgeo.diagnosis.permutations import named_permutations
+        >>> order, words = named_permutations(["frame_0", "frame_1", "frame_10", "frame_2"])[0]
         >>> order.tolist(), words
         ([0, 1, 3, 2], 'the names ordered by their numbers, not as text')
     """
@@ -104,39 +104,39 @@ def _remedy(order: np.ndarray, names: Sequence[str], words: str) -> str:
     return f"Photographs stand beside other photographs' cameras: {pairs}{more} belong."
 
 
-def _told_orders(asis: Hypothesis, evidence: Sequence[Evidence], views: np.ndarray) -> list[np.ndarray]:
+def _fitted_permutations(stated: Hypothesis, evidence: Sequence[Evidence], views: np.ndarray) -> list[np.ndarray]:
     """Orders of all views, found from points, from the solid's outlines, or from pairs of views."""
     found = []
-    count = len(asis.photographs.K)
+    count = len(stated.photographs.K)
     pairs: list[tuple[int, int, np.ndarray]] = []
     for item in evidence:
         if isinstance(item, Points):
-            found.append(assigned(np.minimum(view_costs(item.points, asis.beside) / item.limit, 1e3)))
-        elif isinstance(item, Solids) and item.silhouettes is not None:
+            found.append(assign_cameras(np.minimum(view_costs(item.points, stated.beside) / item.limit, 1e3)))
+        elif isinstance(item, VoxelModel) and item.silhouettes is not None:
             order = np.arange(count)
             kept = np.array(item.silhouettes.views)
-            order[kept] = kept[assigned(-_overlaps(item, asis.photographs))]
+            order[kept] = kept[assign_cameras(-_overlaps(item, stated.photographs))]
             found.append(order)
         elif isinstance(item, Features):
-            pairs += _feature_costs(item, asis.photographs, views)
-        elif isinstance(item, Outlines) and len(item.outlines) <= MOST_OUTLINES:
-            pairs += _outline_costs(item, asis.photographs, views)
+            pairs += _feature_costs(item, stated.photographs, views)
+        elif isinstance(item, Silhouettes) and len(item.outlines) <= MOST_SILHOUETTES:
+            pairs += _silhouette_costs(item, stated.photographs, views)
     if pairs and len(views) > 1:
         first = np.searchsorted(views, [first for first, _, _ in pairs])
         second = np.searchsorted(views, [second for _, second, _ in pairs])
         order = np.arange(count)
-        order[views] = views[search_order(first, second, np.stack([costs for _, _, costs in pairs]))]
+        order[views] = views[search_permutation(first, second, np.stack([costs for _, _, costs in pairs]))]
         found.append(order)
     return found
 
 
-def assigned(costs: np.ndarray) -> np.ndarray:
+def assign_cameras(costs: np.ndarray) -> np.ndarray:
     """The camera (V,) of each view that makes the sum of costs (V, V) least; views of unknown cost keep theirs if free.
 
     Example:
         >>> import numpy as np
-        >>> from lsmgeo.diagnosis.permutations import assigned
-        >>> assigned(np.array([[5.0, 0.1, 5.0], [0.2, 5.0, 5.0], [np.nan, np.nan, np.nan]])).tolist()
+        >>> from lsmgeo.diagnosis.permutations import assign_cameras
+        >>> assign_cameras(np.array([[5.0, 0.1, 5.0], [0.2, 5.0, 5.0], [np.nan, np.nan, np.nan]])).tolist()
         [1, 0, 2]
     """
     from scipy.optimize import linear_sum_assignment
@@ -146,7 +146,7 @@ def assigned(costs: np.ndarray) -> np.ndarray:
     return np.asarray(linear_sum_assignment(filled)[1], int)
 
 
-def _overlaps(solids: Solids, cameras: Geometry) -> np.ndarray:
+def _overlaps(solids: VoxelModel, cameras: Geometry) -> np.ndarray:
     """Intersection over union of each view's outline with the solid in each camera, (N, N)."""
     assert solids.silhouettes is not None
     views, masks, steps = solids.silhouettes
@@ -156,7 +156,7 @@ def _overlaps(solids: Solids, cameras: Geometry) -> np.ndarray:
         for row, (mask, step) in enumerate(zip(masks, steps, strict=True)):
             key = (mask.shape, step)
             if key not in drawn:
-                drawn[key] = draw_solid(solids.solid, cameras, camera, *key)
+                drawn[key] = draw_cells(solids.solid, cameras, camera, *key)
             table[row, column] = intersection_over_union(drawn[key], mask)
     return table
 
@@ -175,7 +175,7 @@ def _feature_costs(features: Features, cameras: Geometry, views: np.ndarray) -> 
     return found
 
 
-def _outline_costs(outlines: Outlines, cameras: Geometry, views: np.ndarray) -> list[tuple[int, int, np.ndarray]]:
+def _silhouette_costs(outlines: Silhouettes, cameras: Geometry, views: np.ndarray) -> list[tuple[int, int, np.ndarray]]:
     found = []
     for first, second in outlines.pairs:
         costs = np.ones((len(views), len(views)))
@@ -187,7 +187,7 @@ def _outline_costs(outlines: Outlines, cameras: Geometry, views: np.ndarray) -> 
     return found
 
 
-def search_order(first: np.ndarray, second: np.ndarray, costs: np.ndarray) -> np.ndarray:
+def search_permutation(first: np.ndarray, second: np.ndarray, costs: np.ndarray) -> np.ndarray:
     """Which camera each of N views has, told from pairs of views: grown from likely pairs, then improved by exchanges.
 
     Args:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lsmgeo.diagnosis.geometry import Geometry, fundamental, homogeneous, project, relative
+from lsmgeo.diagnosis.two_view_geometry import Geometry, fundamental, homogeneous, project, relative
 
 if TYPE_CHECKING:
     from lsmgeo.data import SparsePoints
@@ -42,7 +42,7 @@ def residuals(matches: Matches, geometry: Geometry) -> np.ndarray:
     H = _relations(geometry, matches.first, matches.second)[1][matches.pair]
     found = np.stack([sampson_distances(matches, geometry), np.zeros(len(matches.pair))], 1)
     still = np.isfinite(H[:, 0, 0])
-    moved = _moved(H[still], matches.pixels[still, 0])
+    moved = _transferred(H[still], matches.pixels[still, 0])
     found[still] = 0.5 * np.nan_to_num(moved - matches.pixels[still, 1], nan=FARTHEST)
     return found
 
@@ -61,7 +61,7 @@ def _relations(geometry: Geometry, first: np.ndarray, second: np.ndarray) -> tup
     return fundamental(geometry, first, second), H
 
 
-def _moved(H: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def _transferred(H: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore", divide="ignore"):
         moved = (H @ homogeneous(pixels)[..., None])[..., 0]
         return np.asarray(moved[..., :2] / moved[..., 2:])
@@ -76,7 +76,7 @@ def _distances(pixels: np.ndarray, F: np.ndarray, H: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore", divide="ignore"):
         distance = (b * line).sum(-1) / root
     if np.isfinite(H).any():
-        apart = 0.5 * np.linalg.norm(_moved(H, pixels[..., 0, :]) - pixels[..., 1, :], axis=-1)
+        apart = 0.5 * np.linalg.norm(_transferred(H, pixels[..., 0, :]) - pixels[..., 1, :], axis=-1)
         distance = np.where(np.isfinite(H[..., 0, 0]), apart, distance)
     # Neither line nor homography says anything of such a match: no camera pair can be worse.
     return np.nan_to_num(distance, nan=FARTHEST, posinf=FARTHEST, neginf=-FARTHEST)

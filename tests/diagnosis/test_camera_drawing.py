@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from lsmgeo.data.posed import Voxels
 from lsmgeo.diagnosis.camera_drawing import Content, draw_cameras, surface_of
-from lsmgeo.diagnosis.geometry import Geometry
+from lsmgeo.diagnosis.two_view_geometry import Geometry
 from lsmgeo.grids import VoxelGrid
 
 K = np.array([[100.0, 0, 31.5], [0, 100, 23.5], [0, 0, 1]])

@@ -7,13 +7,11 @@ import pytest
 import torch
 
 from lsmgeo.data.posed import Observations, SparsePoints, Voxels
-from lsmgeo.diagnosis.check_silhouettes import Silhouettes, Solid, near_cells, overlap, within_a_cell
-from lsmgeo.diagnosis.check_surfaces import Surfaces, relative_errors, seen_errors
+from lsmgeo.diagnosis.depth_consistency import Surfaces, best_neighbour_errors, relative_errors
 from lsmgeo.diagnosis.feature_matching import Matches
 from lsmgeo.diagnosis.findings import Check, badness
-from lsmgeo.diagnosis.geometry import Geometry, Hypothesis
 from lsmgeo.diagnosis.half_pixel import find_shifts
-from lsmgeo.diagnosis.permutations import assigned, named_orders, search_order
+from lsmgeo.diagnosis.permutations import assign_cameras, named_permutations, search_permutation
 from lsmgeo.diagnosis.residuals import (
     in_front,
     pair_distances,
@@ -22,6 +20,8 @@ from lsmgeo.diagnosis.residuals import (
     sampson_distances,
     view_costs,
 )
+from lsmgeo.diagnosis.silhouette_consistency import Cells, Masks, near_cells, overlap, within_a_cell
+from lsmgeo.diagnosis.two_view_geometry import Geometry, Hypothesis
 from lsmgeo.grids import VoxelGrid
 
 RNG = np.random.default_rng(0)
@@ -119,8 +119,8 @@ def test_reprojection_errors_are_the_noise_that_was_added():
     assert (depths > 0).all()
     np.testing.assert_array_equal(views, np.repeat([0, 1, 2], 30))
     costs = view_costs(sparse, geometry)
-    np.testing.assert_array_equal(assigned(costs), [0, 1, 2])
-    np.testing.assert_array_equal(assigned(costs[:, [2, 0, 1]]), [1, 2, 0])
+    np.testing.assert_array_equal(assign_cameras(costs), [0, 1, 2])
+    np.testing.assert_array_equal(assign_cameras(costs[:, [2, 0, 1]]), [1, 2, 0])
 
 
 @pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (0.5, 0.5), (-0.3, 0.6)])
@@ -152,7 +152,7 @@ def test_depth_of_a_plane_agrees_with_itself_and_with_no_other():
     surfaces = Surfaces(maps, (1, 1), (np.stack([u, v], 1).astype(float),) * 2, tuple(m[v, u] for m in maps))
     np.testing.assert_allclose(relative_errors(surfaces, Hypothesis(geometry, geometry)), 0, atol=1e-12)
     wrong = surfaces._replace(maps=(maps[0], maps[1] * 1.1), depths=(surfaces.depths[0], surfaces.depths[1] * 1.1))
-    found = seen_errors(wrong, Hypothesis(geometry, geometry))
+    found = best_neighbour_errors(wrong, Hypothesis(geometry, geometry))
     np.testing.assert_allclose(found[0][2], 3 / 3.3 - 1)
     np.testing.assert_allclose(found[1][2], 4.3 / 4 - 1)
     # Twice all depth is not this scene, for the cameras stay one apart.
@@ -164,14 +164,14 @@ def test_a_solid_fills_its_own_silhouette_and_no_other():
     K = np.array([[100.0, 0, 32], [0, 100, 32], [0, 0, 1]])
     geometry = Geometry(K[None], np.eye(3)[None], np.array([[0.0, 0, 5]]))
     grid = np.stack(np.meshgrid(*[np.arange(-0.45, 0.5, 0.1)] * 3), -1).reshape(-1, 3)
-    solid = Solid(grid, 0.1)
+    solid = Cells(grid, 0.1)
     mask = np.zeros((64, 64), bool)
     # A cube of side 1 whose front is 4.5 away spans 100 / 4.5 = 22 pixels.
     mask[21:44, 21:44] = True
-    recall, union = overlap(Silhouettes((0,), (mask,), (1,)), solid, geometry)
+    recall, union = overlap(Masks((0,), (mask,), (1,)), solid, geometry)
     assert recall[0] == 1
     assert union[0] > 0.85
-    recall, union = overlap(Silhouettes((0,), (np.roll(mask, 18, 1),), (1,)), solid, geometry)
+    recall, union = overlap(Masks((0,), (np.roll(mask, 18, 1),), (1,)), solid, geometry)
     assert recall[0] < 0.5
     assert union[0] < 0.2
 
@@ -191,19 +191,19 @@ def test_an_order_is_found_from_pairs_of_views():
     costs = rng.uniform(0.3, 1, (len(pairs), count, count))
     for pair, (a, b) in enumerate(pairs):
         costs[pair, order[a], order[b]] = rng.uniform(0, 0.1)
-    found = search_order(np.array([a for a, _ in pairs]), np.array([b for _, b in pairs]), costs)
+    found = search_permutation(np.array([a for a, _ in pairs]), np.array([b for _, b in pairs]), costs)
     np.testing.assert_array_equal(found, order)
 
 
 def test_orders_that_have_names():
     names = ["a10", "a2", "a1"]
-    orders = {words: order.tolist() for order, words in named_orders(names)}
+    orders = {words: order.tolist() for order, words in named_permutations(names)}
     # As text a1, a10, a2; by number a1, a2, a10: the files' order is neither, and rows are paired by their ranks.
     assert orders["the names ordered by their numbers, not as text"] == [1, 0, 2]
     assert orders["the order reversed"] == [2, 1, 0]
     assert orders["every photograph at the camera 1 place later"] == [1, 2, 0]
     assert orders["every photograph at the camera 1 place earlier"] == [2, 0, 1]
-    assert len(named_orders(["9" * 5000, "1" * 5000])) == 2
+    assert len(named_permutations(["9" * 5000, "1" * 5000])) == 2
 
 
 def test_badness_is_a_multiple_of_the_limit():

@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
 
 __all__ = [
-    "Geometry", "Hypothesis", "as_they_are", "evenly", "fundamental", "homogeneous", "project", "relative", "scaling",
+    "Geometry", "Hypothesis", "evenly", "fundamental", "homogeneous", "project", "relative", "scaling",
+    "stated_hypothesis",
 ]  # fmt: skip
 
 # A baseline below this fraction of the cameras' distance from the origin is rounding.
@@ -56,7 +57,7 @@ class Hypothesis(NamedTuple):
     along_ray: bool = False
 
 
-def as_they_are(scene: PosedImages) -> Hypothesis:
+def stated_hypothesis(scene: PosedImages) -> Hypothesis:
     """The cameras that the scene has, float64."""
     K, E = (np.array(torch.as_tensor(value).double()) for value in scene.cameras[:2])
     geometry = Geometry(K, E[:, :3, :3].copy(), E[:, :3, 3].copy())

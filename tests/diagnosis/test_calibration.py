@@ -10,8 +10,8 @@ from PIL import Image
 
 from lsmgeo import data
 from lsmgeo.data import Board, CalibratedLens, Calibration, Rig
-from lsmgeo.diagnosis.board_fitting import board_points, find_corners
-from lsmgeo.diagnosis.boards import examine_calibration
+from lsmgeo.diagnosis.check_calibration import examine_calibration
+from lsmgeo.diagnosis.chessboards import board_points, find_corners
 from lsmgeo.diagnosis.findings import report
 from tests.data.real_sets import real_set
 

@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from lsmgeo import VoxelGrid, data
-from lsmgeo.diagnosis.check_solids import examine_voxels
+from lsmgeo.diagnosis.check_voxels import examine_voxels
 from tests.data.real_sets import real_set
 from tests.data.release_writers import binvox_bytes
 

@@ -79,7 +79,7 @@ def examine_voxels(voxels: Voxels, path: str | Path) -> Findings:
 
 
 def _placed(voxels: Voxels) -> _Placed:
-    T = voxels.grid.world_from_lattice.double().numpy()
+    T = voxels.world_from_lattice
     occupied = voxels.occupancy.numpy().transpose(2, 1, 0)
     step = T[:3, :3].diagonal()
     lower = T[:3, 3] - 0.5 * step
@@ -174,7 +174,7 @@ def _cause(placed: _Placed, samples: np.ndarray, path: Path, percent: float) -> 
         return None
     # The fewest changes first, so that a symmetric solid is not said to be turned as well.
     for name, other in _placements(placed, path):
-        for changes, words, occupied in sorted(_orders(other.occupied), key=lambda order: order[0]):
+        for changes, words, occupied in sorted(_axis_permutations(other.occupied), key=lambda order: order[0]):
             fits = 100 * _inside(other._replace(occupied=occupied), samples)
             if fits < 100 * INSIDE or fits < percent + 100 * CLEARLY:
                 continue
@@ -198,7 +198,7 @@ def _placements(placed: _Placed, path: Path) -> list[tuple[str, _Placed]]:
     return found
 
 
-def _orders(occupied: np.ndarray) -> list[tuple[int, str, np.ndarray]]:
+def _axis_permutations(occupied: np.ndarray) -> list[tuple[int, str, np.ndarray]]:
     """The grid with its axes in each order and direction: how many changes, in words, and the array."""
     orders = []
     for axes in permutations(range(3)):

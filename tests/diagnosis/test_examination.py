@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from lsmgeo.diagnosis import evidence, examine
-from lsmgeo.diagnosis.check_images import examine_photographs
+from lsmgeo.diagnosis.check_images import examine_images
 from lsmgeo.diagnosis.feature_matching import match_features
-from lsmgeo.diagnosis.geometry import as_they_are
-from lsmgeo.diagnosis.permutations import order_mistakes
+from lsmgeo.diagnosis.permutations import permutation_candidates
+from lsmgeo.diagnosis.two_view_geometry import stated_hypothesis
 from lsmgeo.errors import DataError
 from tests.diagnosis.textured import (
     in_order,
@@ -81,7 +81,7 @@ def test_right_cameras_are_good(photographs):
 
 @pytest.mark.parametrize("mistake", [*COMMON, RARE[0], *(pytest.param(rare, marks=LONG) for rare in RARE[1:])])
 def test_a_mistake_is_told_from_features_alone(photographs, mistake):
-    findings = examine_photographs(planted(photographs, mistake)).findings
+    findings = examine_images(planted(photographs, mistake)).findings
     assert findings.verdict == "bad"
     assert findings.cause.name == mistake
 
@@ -90,7 +90,7 @@ def test_a_mistake_is_told_from_features_alone(photographs, mistake):
 def test_half_a_pixel_is_found_though_all_checks_pass(photographs, shift):
     K, _ = matrices(photographs)
     K[:, :2, 2] += shift
-    findings = examine_photographs(with_cameras(photographs, K=K)).findings
+    findings = examine_images(with_cameras(photographs, K=K)).findings
     assert all(check.passed for check in findings.checks)
     assert findings.cause.name == "half a pixel"
     assert ("subtract 0.5" if shift > 0 else "add 0.5") in findings.cause.remedy
@@ -99,7 +99,7 @@ def test_half_a_pixel_is_found_though_all_checks_pass(photographs, shift):
 def test_a_smaller_shift_is_no_half_pixel(photographs):
     K, _ = matrices(photographs)
     K[:, :2, 2] += 0.12
-    assert examine_photographs(with_cameras(photographs, K=K)).findings.verdict == "good"
+    assert examine_images(with_cameras(photographs, K=K)).findings.verdict == "good"
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_a_smaller_shift_is_no_half_pixel(photographs):
     ],
 )
 def test_orders_are_named(photographs, order, words):
-    cause = examine_photographs(in_order(photographs, order)).findings.cause
+    cause = examine_images(in_order(photographs, order)).findings.cause
     assert cause.name == "frames shuffled"
     assert words in cause.remedy
 
@@ -122,7 +122,7 @@ def test_one_view_that_is_off_is_named(photographs, axis, degrees):
     # Some pixels: more than a view of its own that is right is ever off, less than what fails a pair.
     turn, _ = cv2.Rodrigues(np.radians(degrees) * np.eye(3)[axis])
     E[3, :3] = turn @ E[3, :3]
-    findings = examine_photographs(with_cameras(photographs, E=E)).findings
+    findings = examine_images(with_cameras(photographs, E=E)).findings
     assert findings.verdict == "bad"
     assert findings.cause.name == "some views are off"
     assert "frame_3.png" in findings.cause.evidence
@@ -132,11 +132,12 @@ def test_one_view_that_is_off_is_named(photographs, axis, degrees):
 def test_poses_may_be_shuffled_while_every_photograph_keeps_its_own_intrinsics(photographs):
     K, _ = matrices(photographs)
     own = K * np.linspace(1.0, 1.1, len(K))[:, None, None] ** np.array([[1, 1, 0], [1, 1, 0], [0, 0, 0]])
-    asis = as_they_are(with_cameras(photographs, K=own))
+    stated = stated_hypothesis(with_cameras(photographs, K=own))
     found = [
-        candidate.hypothesis.photographs for candidate in order_mistakes(asis, photographs.names, [], np.arange(7))
+        candidate.hypothesis.photographs
+        for candidate in permutation_candidates(stated, photographs.names, [], np.arange(7))
     ]
-    backwards = [cameras for cameras in found if np.array_equal(cameras.t, asis.photographs.t[::-1])]
+    backwards = [cameras for cameras in found if np.array_equal(cameras.t, stated.photographs.t[::-1])]
     assert any(np.array_equal(cameras.K, own) for cameras in backwards)
     assert any(np.array_equal(cameras.K, own[::-1]) for cameras in backwards)
 
@@ -147,7 +148,7 @@ def test_what_no_mistake_explains_is_said(photographs):
     for pose in E:
         turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
         pose[:3, :3] = turn * np.sign(np.linalg.det(turn))
-    findings = examine_photographs(with_cameras(photographs, E=E)).findings
+    findings = examine_images(with_cameras(photographs, E=E)).findings
     assert findings.verdict == "bad"
     assert findings.cause is None
     assert "no single mistake explains this" in " ".join(findings.remarks)
@@ -167,8 +168,8 @@ def test_moving_and_scaling_the_world_changes_nothing(room, photographs):
     moved_E[:, :3, :3], moved_E[:, :3, 3] = R, t
     moved = with_cameras(scene, E=moved_E)
     points = scene.points._replace(positions=scale * scene.points.positions @ turn.T + shift)
-    before = examine_photographs(scene).findings
-    after = examine_photographs(replace(moved, points=points)).findings
+    before = examine_images(scene).findings
+    after = examine_images(replace(moved, points=points)).findings
     assert after.verdict == before.verdict == "good"
     np.testing.assert_allclose([c.value for c in after.checks], [c.value for c in before.checks], rtol=1e-6)
 
@@ -183,18 +184,18 @@ def test_moving_and_scaling_the_world_changes_nothing(room, photographs):
 )
 def test_a_mistake_is_told_from_points_alone(room, blank, mistake):
     scene = with_points(blank, room)
-    assert examine_photographs(scene).findings.verdict == "good"
+    assert examine_images(scene).findings.verdict == "good"
     wrong = planted(scene, mistake)
     if mistake == "frames shuffled":
         order = np.random.default_rng(3).permutation(len(scene))
         K, E = matrices(scene)
         wrong = with_cameras(scene, K=K[order], E=E[order])
-    cause = examine_photographs(wrong).findings.cause
+    cause = examine_images(wrong).findings.cause
     assert cause.name == mistake
 
 
 def test_reprojection_error_is_that_of_the_noise(room, blank):
-    findings = examine_photographs(with_points(blank, room, noise_px=0.3)).findings
+    findings = examine_images(with_points(blank, room, noise_px=0.3)).findings
     # The median length of a vector of two normal errors.
     np.testing.assert_allclose(check(findings, "reprojection").value, 0.3 * np.sqrt(2 * np.log(2)), rtol=0.1)
 
@@ -202,20 +203,20 @@ def test_reprojection_error_is_that_of_the_noise(room, blank):
 @pytest.mark.parametrize("mistake", [COMMON[0], *(pytest.param(name, marks=LONG) for name in COMMON[1:4])])
 def test_a_mistake_is_told_from_depth_alone(room, blank, mistake):
     scene = with_depth(blank, room)
-    good = examine_photographs(scene).findings
+    good = examine_images(scene).findings
     assert good.verdict == "good"
     assert check(good, "depth of one view").value < 0.5
-    cause = examine_photographs(planted(scene, mistake)).findings.cause
+    cause = examine_images(planted(scene, mistake)).findings.cause
     assert cause.name == mistake
 
 
 def test_depth_in_millimetres_and_along_the_ray_are_named(room, blank):
-    findings = examine_photographs(with_depth(blank, room, 1000 * room.depth)).findings
+    findings = examine_images(with_depth(blank, room, 1000 * room.depth)).findings
     assert findings.cause.name == "depth in other units"
     assert "0.001" in findings.cause.remedy
     v, u = np.mgrid[:240, :320]
     rays = np.stack([u, v, np.ones_like(u)], -1)[None] @ np.linalg.inv(room.K)[:, None].transpose(0, 1, 3, 2)
-    findings = examine_photographs(with_depth(blank, room, room.depth * np.linalg.norm(rays, axis=-1))).findings
+    findings = examine_images(with_depth(blank, room, room.depth * np.linalg.norm(rays, axis=-1))).findings
     assert findings.cause.name == "depth along the ray"
 
 
@@ -223,12 +224,12 @@ def test_depth_in_millimetres_and_along_the_ray_are_named(room, blank):
 @pytest.mark.parametrize("solid", [False, pytest.param(True, marks=LONG)])
 def test_a_mistake_is_told_from_outlines_alone(cut_out, solid, mistake):
     scene = with_voxels(cut_out) if solid else cut_out
-    good = examine_photographs(scene).findings
+    good = examine_images(scene).findings
     assert good.verdict == "good"
     if solid:
         assert check(good, "inside the outlines").value > 99
         assert check(good, "overlap").value > 80
-    cause = examine_photographs(planted(scene, mistake)).findings.cause
+    cause = examine_images(planted(scene, mistake)).findings.cause
     assert cause.name == mistake
 
 
@@ -236,7 +237,7 @@ def test_a_mistake_is_told_from_outlines_alone(cut_out, solid, mistake):
 def test_half_a_pixel_is_told_from_outlines(cut_out, shift):
     K, _ = matrices(cut_out)
     K[:, :2, 2] += shift
-    cause = examine_photographs(with_cameras(cut_out, K=K)).findings.cause
+    cause = examine_images(with_cameras(cut_out, K=K)).findings.cause
     assert (cause and cause.name) == ("half a pixel" if shift else None)
 
 
@@ -244,11 +245,11 @@ def test_cameras_in_one_place_are_compared_by_their_rotations(tmp_path):
     rolls = [0.0, 0.25, 0.5, 0.8]
     traced = trace([(0.3, 0.2, -2.2)] * 4, rolls)
     scene = write(traced, tmp_path)
-    findings = examine_photographs(scene).findings
+    findings = examine_images(scene).findings
     assert findings.verdict == "good"
     assert check(findings, "epipolar").value < 0.2
     assert "all cameras are in one place" in " ".join(findings.remarks)
-    assert examine_photographs(planted(scene, "rotation transposed")).findings.verdict == "bad"
+    assert examine_images(planted(scene, "rotation transposed")).findings.verdict == "bad"
 
 
 def test_views_of_different_sizes(room, photographs, tmp_path):
@@ -264,20 +265,20 @@ def test_views_of_different_sizes(room, photographs, tmp_path):
     height, width = (value.clone() for value in scene.cameras[2:])
     height[2], width[2] = 720, 960
     scene = replace(scene, cameras=scene.cameras._replace(height=height, width=width))
-    findings = examine_photographs(scene).findings
+    findings = examine_images(scene).findings
     assert findings.verdict == "good"
     assert "2 sizes from 320 x 240 to 960 x 720" in dict(findings.facts)["photographs"]
 
 
 def test_nothing_to_measure_is_no_verdict(blank):
-    assert examine_photographs(blank).findings.verdict == "unknown"
+    assert examine_images(blank).findings.verdict == "unknown"
     alone = replace(
         blank,
         names=blank.names[:1],
         paths=blank.paths[:1],
         cameras=type(blank.cameras)(*(torch.as_tensor(value)[:1] for value in blank.cameras)),
     )
-    findings = examine_photographs(alone).findings
+    findings = examine_images(alone).findings
     assert findings.verdict == "unknown"
     assert findings.checks == ()
 
@@ -287,7 +288,7 @@ def test_a_damaged_photograph_is_a_data_error(photographs, tmp_path):
     bad.write_bytes(photographs.paths[0].read_bytes()[:2000])
     scene = replace(photographs, paths=(bad, *photographs.paths[1:]))
     with pytest.raises(DataError, match=r"bad\.png"):
-        examine_photographs(scene)
+        examine_images(scene)
 
 
 def test_of_many_photographs_some_are_looked_at(photographs, monkeypatch):
@@ -306,7 +307,7 @@ def test_of_many_photographs_some_are_looked_at(photographs, monkeypatch):
         return match_features(scene, views[:0])
 
     monkeypatch.setattr(evidence, "match_features", no_matches)
-    findings = examine_photographs(scene).findings
+    findings = examine_images(scene).findings
     assert len(looked_at) == 40
     assert looked_at[:4] == [0, 1, 2, 3]
     assert looked_at[-4:] == [86, 87, 88, 89]

@@ -6,18 +6,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lsmgeo.diagnosis.check_surfaces import relative_errors
-from lsmgeo.diagnosis.evidence import DepthMaps, Features, Outlines, StereoPair, principal_offsets
+from lsmgeo.diagnosis.depth_consistency import relative_errors
+from lsmgeo.diagnosis.evidence import DepthMaps, Features, Silhouettes, StereoPair, principal_offsets
 from lsmgeo.diagnosis.feature_matching import LEAST_VERIFIED, MAX_VIEWS, choose_views, count_features
 from lsmgeo.diagnosis.findings import LIMITS, Gap, counted
-from lsmgeo.diagnosis.geometry import evenly
+from lsmgeo.diagnosis.two_view_geometry import evenly
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from lsmgeo.data import PosedImages
     from lsmgeo.diagnosis.evidence import Evidence
-    from lsmgeo.diagnosis.geometry import Geometry, Hypothesis
+    from lsmgeo.diagnosis.two_view_geometry import Geometry, Hypothesis
 
 __all__ = ["describe_scene", "find_gap", "implausibilities"]
 
@@ -28,10 +28,10 @@ MOST_COUNTED = 8
 
 
 def describe_scene(
-    scene: PosedImages, views: np.ndarray, evidence: Sequence[Evidence], asis: Hypothesis, sizes: np.ndarray
+    scene: PosedImages, views: np.ndarray, evidence: Sequence[Evidence], stated: Hypothesis, sizes: np.ndarray
 ) -> list[tuple[str, str]]:
     """Facts as (name, text)."""
-    cameras = asis.photographs
+    cameras = stated.photographs
     facts = [("format", scene.source), ("photographs", f"{len(scene)}, {_sizes(sizes)}")]
     if len(views) < len(scene):
         facts.append(("looked at", f"{len(views)} of them (at most {MAX_VIEWS}), in runs of successive ones"))
@@ -46,7 +46,7 @@ def describe_scene(
         near = np.sort(apart, axis=1)[:, 1]
         facts.append(("baselines", f"{np.median(near):.4g} to the nearest (median), {apart.max():.4g} at most"))
     for item in evidence:
-        facts += _facts_of(item, asis)
+        facts += _facts_of(item, stated)
     if scene.points is not None:
         observed = sum(len(observation.points) for observation in scene.points.observations)
         facts.append(("sparse points", f"{len(scene.points.positions)}, {counted(observed, 'observations')}"))
@@ -57,20 +57,20 @@ def describe_scene(
     return facts
 
 
-def _facts_of(item: Evidence, asis: Hypothesis) -> list[tuple[str, str]]:
+def _facts_of(item: Evidence, stated: Hypothesis) -> list[tuple[str, str]]:
     if isinstance(item, Features):
         matches = item.matches
         seen = len(np.unique(np.concatenate([matches.first, matches.second])))
         text = f"{len(matches.pair)} in {counted(len(matches.first), 'pairs')} of {seen} photographs"
         return [("matched features", text)]
-    if isinstance(item, Outlines):
+    if isinstance(item, Silhouettes):
         return [("outlines", f"{len(item.outlines)} seen whole")]
     if isinstance(item, (DepthMaps, StereoPair)):
         depths = np.concatenate(item.surfaces.depths)
         low, high = np.percentile(depths, (2, 98))
         text = f"{low:.4g} to {high:.4g} (2nd to 98th percentile)"
         if isinstance(item, DepthMaps):
-            errors = relative_errors(item.surfaces, asis)
+            errors = relative_errors(item.surfaces, stated)
             if len(errors):
                 text += f"; {100 * float(np.mean(np.abs(errors) < 0.02)):.3g} % within 2 % of another view's"
         return [("depth", text)]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lsmgeo import data
-from lsmgeo.diagnosis.check_images import examine_photographs
+from lsmgeo.diagnosis.check_images import examine_images
 from tests.data.real_sets import real_set
 from tests.diagnosis.textured import planted
 
@@ -21,14 +21,14 @@ QUICK = {"strecha_fountain_quarter": ("half a pixel", "frames shuffled"), "colma
 
 
 def named(name, mistake):
-    cause = examine_photographs(planted(data.open(real_set(name)), mistake)).findings.cause
+    cause = examine_images(planted(data.open(real_set(name)), mistake)).findings.cause
     return None if cause is None else cause.name
 
 
 @pytest.mark.parametrize("name", SETS)  # in one test, so that one worker matches a set and no other does
 def test_the_measured_figure_is_reached_and_planted_mistakes_are_named(name):
     kind, expected = SETS[name]
-    findings = examine_photographs(data.open(real_set(name))).findings
+    findings = examine_images(data.open(real_set(name))).findings
     assert findings.verdict == "good"
     check = next(check for check in findings.checks if kind in check.name)
     assert check.measured > 1000

@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.geometry import Hypothesis, evenly, homogeneous, project
+from lsmgeo.diagnosis.two_view_geometry import Hypothesis, evenly, homogeneous, project
 
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
 
 __all__ = [
-    "Surfaces", "load_surfaces", "relative_errors", "seen_errors", "surface_points", "thinned", "warp_errors", "warped",
+    "Surfaces", "best_neighbour_errors", "load_surfaces", "relative_errors", "surface_points", "thinned", "warp_errors",
+    "warp_view",
 ]  # fmt: skip
 
 # Pixels of a view that are carried into others, and pixels that are kept of a map.
@@ -95,7 +96,9 @@ def surface_points(surfaces: Surfaces, hypothesis: Hypothesis, view: int) -> np.
     return np.asarray((rays * z[:, None] - t) @ np.linalg.inv(R).T)
 
 
-def _seen(surfaces: Surfaces, hypothesis: Hypothesis, points: np.ndarray, view: int) -> tuple[np.ndarray, np.ndarray]:
+def _compare_depth(
+    surfaces: Surfaces, hypothesis: Hypothesis, points: np.ndarray, view: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Depth (N,) of points in a view and what its map says there, NaN where it says nothing."""
     maps, step = surfaces.maps[view], surfaces.steps[view]
     assert maps is not None
@@ -119,10 +122,12 @@ def relative_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> np.ndarray:
     that are wrong may place views anywhere), and of them the one counts that agrees best. Pixels that another surface
     hides give large differences; the median bears them.
     """
-    return np.concatenate([np.zeros(0), *(errors for _, _, errors in seen_errors(surfaces, hypothesis).values())])
+    return np.concatenate(
+        [np.zeros(0), *(errors for _, _, errors in best_neighbour_errors(surfaces, hypothesis).values())]
+    )
 
 
-def seen_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> dict[int, tuple[int, np.ndarray, np.ndarray]]:
+def best_neighbour_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> dict[int, tuple[int, np.ndarray, np.ndarray]]:
     """For each view that falls into others: the one that counts, which pixels it knows (N,) bool, and the errors."""
     best = {}
     for view in surfaces.views:
@@ -130,7 +135,7 @@ def seen_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> dict[int, tuple[i
         found = []
         for other in surfaces.targets:
             if other != view:
-                depth, there = _seen(surfaces, hypothesis, points, other)
+                depth, there = _compare_depth(surfaces, hypothesis, points, other)
                 known = np.isfinite(there)
                 if known.mean() >= LEAST_SEEN:
                     found.append((other, known, (depth[known] - there[known]) / there[known]))
@@ -154,12 +159,12 @@ def warp_errors(
     Returns:
         (M,) and (M,) absolute differences at the pixels that fall into the other picture.
     """
-    each = [warped(surfaces, hypothesis, pictures, view)[1:] for view in surfaces.views]
+    each = [warp_view(surfaces, hypothesis, pictures, view)[1:] for view in surfaces.views]
     moved, unmoved = (np.concatenate([np.zeros(0), *parts]) for parts in zip(*each, strict=True))
     return moved, unmoved
 
 
-def warped(
+def warp_view(
     surfaces: Surfaces, hypothesis: Hypothesis, pictures: tuple[np.ndarray, ...], view: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For one of two views the pixels (M, 2) that fall into the other picture, and the differences as `warp_errors`."""

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lsmgeo.diagnosis.check_images import examine_photographs
-from lsmgeo.diagnosis.explain import is_decisive, is_suspicious
+from lsmgeo.diagnosis.check_images import examine_images
+from lsmgeo.diagnosis.find_cause import is_decisive, is_suspicious
 from lsmgeo.diagnosis.findings import Check
 from lsmgeo.diagnosis.half_pixel import Shift, is_half_a_pixel, is_large, nearer_half
 from tests.diagnosis.textured import planted, trace, with_depth, write
@@ -27,7 +27,7 @@ def turntable(tmp_path):
 
 
 def test_depth_all_around_an_object_is_compared_with_views_of_the_same_side(turntable):
-    findings = examine_photographs(turntable).findings
+    findings = examine_images(turntable).findings
     assert findings.verdict == "good"
     (check,) = findings.checks
     assert check.name == "depth of one view in another"
@@ -40,11 +40,11 @@ def test_what_leaves_no_trace_is_said(tmp_path):
     eyes = [(2.2 * np.sin(angle), -0.02, -2.2 * np.cos(angle)) for angle in angles]
     scene = write(trace(eyes, [0.0] * 4), tmp_path)
     for each in (scene, planted(scene, "y flipped")):
-        findings = examine_photographs(each).findings
+        findings = examine_images(each).findings
         assert findings.verdict == "good"
         (remark,) = [remark for remark in findings.remarks if "no trace" in remark]
         assert remark.endswith(": y flipped")
-    cause = examine_photographs(planted(scene, "OpenGL axes")).findings.cause
+    cause = examine_images(planted(scene, "OpenGL axes")).findings.cause
     assert cause is not None
     assert cause.name == "OpenGL axes"
 
@@ -52,7 +52,7 @@ def test_what_leaves_no_trace_is_said(tmp_path):
 def test_rotations_alone_tell_inverted_poses(tmp_path):
     """Right cameras in one place have no parallax, wrong ones do: its absence speaks against no correction."""
     scene = write(trace([(0.3, 0.2, -2.2)] * 4, [0.0, 0.25, 0.5, 0.8]), tmp_path)
-    cause = examine_photographs(planted(scene, "poses inverted")).findings.cause
+    cause = examine_images(planted(scene, "poses inverted")).findings.cause
     assert cause is not None
     assert "poses inverted" in (
         cause.name,

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.geometry import Geometry, evenly, homogeneous, project
+from lsmgeo.diagnosis.two_view_geometry import Geometry, evenly, homogeneous, project
 
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages, Voxels
 
 __all__ = [
-    "Silhouettes", "Solid", "draw_solid", "epipolar_tangency", "intersection_over_union", "load_silhouettes",
-    "near_cells", "occupied_centers", "outline", "overlap", "within_a_cell",
+    "Cells", "Masks", "draw_cells", "epipolar_tangency", "intersection_over_union", "load_masks", "near_cells",
+    "occupied_cells", "outline", "overlap", "within_a_cell",
 ]  # fmt: skip
 
 # An epipole so near to the outline, seen from the outline's middle, makes planes through the baseline that turn a lot
@@ -26,14 +26,14 @@ MARGIN = 2  # empty cells on each side
 HALF_DIAGONAL = 0.75**0.5  # of a cube of side 1
 
 
-class Solid(NamedTuple):
+class Cells(NamedTuple):
     """Occupied cells: their centres (N, 3) in the world, and the length of a cell's side."""
 
     centers: np.ndarray
     cell: float
 
 
-class Silhouettes(NamedTuple):
+class Masks(NamedTuple):
     """Masks (h, w) of some views, thinned to every ``step``-th row and column."""
 
     views: tuple[int, ...]
@@ -41,16 +41,16 @@ class Silhouettes(NamedTuple):
     steps: tuple[int, ...]
 
 
-def occupied_centers(voxels: Voxels) -> Solid:
+def occupied_cells(voxels: Voxels) -> Cells:
     """The occupied cells; of very many, evenly chosen ones."""
-    T = voxels.grid.world_from_lattice.double().reshape(-1, 4, 4)[0].numpy()
+    T = voxels.world_from_lattice
     index = np.argwhere(voxels.occupancy.numpy())[:, ::-1]
     index = index[evenly(len(index), MAX_CELLS)]
     centers = index @ T[:3, :3].T + T[:3, 3]
-    return Solid(centers, float(np.cbrt(abs(np.linalg.det(T[:3, :3])))))
+    return Cells(centers, voxels.voxel_size)
 
 
-def load_silhouettes(scene: PosedImages, views: np.ndarray) -> Silhouettes:
+def load_masks(scene: PosedImages, views: np.ndarray) -> Masks:
     """Read the outlines of some views.
 
     Raises:
@@ -62,10 +62,10 @@ def load_silhouettes(scene: PosedImages, views: np.ndarray) -> Silhouettes:
         assert mask is not None
         steps.append(int(np.ceil(max(mask.shape) / LONGEST_SIDE)))
         masks.append(mask.numpy()[:: steps[-1], :: steps[-1]].copy())
-    return Silhouettes(tuple(views.tolist()), tuple(masks), tuple(steps))
+    return Masks(tuple(views.tolist()), tuple(masks), tuple(steps))
 
 
-def draw_solid(solid: Solid, geometry: Geometry, camera: int, shape: tuple[int, int], step: int) -> np.ndarray:
+def draw_cells(solid: Cells, geometry: Geometry, camera: int, shape: tuple[int, int], step: int) -> np.ndarray:
     """Where a camera sees the cells, (h, w) bool: each one as a square of about its size."""
     import cv2
 
@@ -81,7 +81,7 @@ def intersection_over_union(drawn: np.ndarray, mask: np.ndarray) -> float:
 
 
 def _placed(
-    solid: Solid, geometry: Geometry, camera: int, shape: tuple[int, ...], step: int
+    solid: Cells, geometry: Geometry, camera: int, shape: tuple[int, ...], step: int
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """The columns and rows of the cells that fall into a picture, and a cell's side in its pixels."""
     height, width = shape
@@ -97,7 +97,7 @@ def _placed(
     return columns, rows, side
 
 
-def overlap(silhouettes: Silhouettes, solid: Solid, geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
+def overlap(silhouettes: Masks, solid: Cells, geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
     """For each view the fraction of cells that reach into its outline, and intersection over union with the solid.
 
     Convention:
@@ -111,7 +111,7 @@ def overlap(silhouettes: Silhouettes, solid: Solid, geometry: Geometry) -> tuple
         reach = 2 * int(np.ceil(HALF_DIAGONAL * side)) + 1
         wide = cv2.dilate(mask.astype(np.uint8), np.ones((reach, reach), np.uint8))
         recalls.append((wide[rows, columns] > 0).sum() / len(solid.centers))
-        unions.append(intersection_over_union(draw_solid(solid, geometry, view, mask.shape, step), mask))
+        unions.append(intersection_over_union(draw_cells(solid, geometry, view, mask.shape, step), mask))
     return np.array(recalls), np.array(unions)
 
 
@@ -119,8 +119,8 @@ def near_cells(voxels: Voxels) -> tuple[np.ndarray, np.ndarray]:
     """Cells that are occupied or touch one that is, two more on each side than there are; and world_from_lattice."""
     from scipy.ndimage import binary_dilation
 
-    T = voxels.grid.world_from_lattice.double().reshape(-1, 4, 4)[0].numpy()
-    return binary_dilation(np.pad(voxels.occupancy.numpy(), MARGIN), np.ones((3, 3, 3), bool)), T
+    near = binary_dilation(np.pad(voxels.occupancy.numpy(), MARGIN), np.ones((3, 3, 3), bool))
+    return near, voxels.world_from_lattice
 
 
 def within_a_cell(points: np.ndarray, near: np.ndarray, world_from_lattice: np.ndarray) -> float:

@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from lsmgeo.diagnosis.check_silhouettes import epipolar_tangency, outline
-from lsmgeo.diagnosis.geometry import Geometry
+from lsmgeo.diagnosis.silhouette_consistency import epipolar_tangency, outline
+from lsmgeo.diagnosis.two_view_geometry import Geometry
 
 # An ellipsoid, X = A u + b with |u| = 1: no mirror symmetry, so that mirrored cameras show.
 SHAPE = np.array([[0.42, 0.11, -0.07], [0.0, 0.27, 0.13], [0.0, 0.0, 0.16]])

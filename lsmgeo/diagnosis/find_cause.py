@@ -10,23 +10,23 @@ import numpy as np
 from lsmgeo.diagnosis.camera_errors import (
     SCALES,
     Candidate,
-    camera_mistakes,
-    depth_mistakes,
+    camera_candidates,
+    depth_candidates,
     depth_scaled,
     focal_scaled,
-    resolution_mistakes,
+    resolution_candidates,
     scaled,
 )
 from lsmgeo.diagnosis.findings import CENTRED, SIDES, Check, badness
-from lsmgeo.diagnosis.permutations import order_mistakes
+from lsmgeo.diagnosis.permutations import permutation_candidates
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from lsmgeo.diagnosis.evidence import Evidence
-    from lsmgeo.diagnosis.geometry import Hypothesis
+    from lsmgeo.diagnosis.two_view_geometry import Hypothesis
 
-__all__ = ["Explanation", "explain", "invisible_mistakes", "is_decisive", "is_suspicious", "score"]
+__all__ = ["Explanation", "explain", "invisible_errors", "is_decisive", "is_suspicious", "score"]
 
 # By what factor an error must fall that stays beyond its limit; and how good is as good as the best.
 DECISIVE, TIE, RIVAL = 4.0, 0.05, 0.35
@@ -93,7 +93,7 @@ def is_decisive(before: Sequence[Check], after: Sequence[Check]) -> bool:
 
 
 def explain(
-    asis: Hypothesis,
+    stated: Hypothesis,
     evidence: Sequence[Evidence],
     names: Sequence[str],
     sizes: np.ndarray,
@@ -102,7 +102,7 @@ def explain(
     """Find the mistake whose correction brings the errors down decisively.
 
     Args:
-        asis: the cameras as they are.
+        stated: the cameras as they are.
         evidence: what can be measured again.
         names: the photographs' names.
         sizes: (V, 2) their height and width.
@@ -112,16 +112,16 @@ def explain(
         The explanation, None where there is none; and the names of all mistakes that were tried.
     """
     quick = [item for item in evidence if not item.slow] or list(evidence)
-    before = _measured(evidence, asis)
+    before = _measured(evidence, stated)
     with_depth = [item for item in evidence if getattr(item, "surfaces", None) is not None]
     others = [item for item in evidence if item not in with_depth]
     # What fails without any depth is not explained by it.
-    if not all(check.passed for check in _measured(others, asis)):
+    if not all(check.passed for check in _measured(others, stated)):
         with_depth = []
-    candidates = [*camera_mistakes(asis, sizes), *resolution_mistakes(asis, sizes)]
-    candidates += order_mistakes(asis, names, evidence, views)
-    candidates += depth_mistakes(asis) if with_depth else []
-    candidates += _scales(asis, quick, with_depth)
+    candidates = [*camera_candidates(stated, sizes), *resolution_candidates(stated, sizes)]
+    candidates += permutation_candidates(stated, names, evidence, views)
+    candidates += depth_candidates(stated) if with_depth else []
+    candidates += _scales(stated, quick, with_depth)
     tried = tuple(dict.fromkeys(candidate.name for candidate in candidates))
 
     candidates.sort(key=lambda candidate: COMMON.index(candidate.name) if candidate.name in COMMON else len(COMMON))
@@ -146,20 +146,20 @@ def explain(
     rivals = [name for name in close if not name.startswith(best.name)]
     told = [
         tuple(check for item in evidence for check in item.measure_all(hypothesis))
-        for hypothesis in (asis, best.hypothesis)
+        for hypothesis in (stated, best.hypothesis)
     ]
     return Explanation(best, told[0], told[1], tuple(rivals)), tried
 
 
-def invisible_mistakes(asis: Hypothesis, evidence: Sequence[Evidence], sizes: np.ndarray) -> tuple[str, ...]:
+def invisible_errors(stated: Hypothesis, evidence: Sequence[Evidence], sizes: np.ndarray) -> tuple[str, ...]:
     """Names of common mistakes that would have passed all checks: cameras that are right do not show that they are.
 
     Args:
-        asis: the cameras as they are, which pass.
+        stated: the cameras as they are, which pass.
         evidence: what can be measured again.
         sizes: (V, 2) height and width of the photographs.
     """
-    planted = [*camera_mistakes(asis, sizes), scaled(asis, np.full(2, 0.5))]
+    planted = [*camera_candidates(stated, sizes), scaled(stated, np.full(2, 0.5))]
     usual = {candidate.name: candidate.hypothesis for candidate in reversed(planted) if candidate.name in COMMON[:4]}
     return tuple(name for name in COMMON[:4] if not is_suspicious(_measured(evidence, usual[name])))
 
@@ -168,12 +168,12 @@ def _measured(evidence: Sequence[Evidence], hypothesis: Hypothesis) -> list[Chec
     return [check for item in evidence for check in item.measure(hypothesis)]
 
 
-def _scales(asis: Hypothesis, quick: Sequence[Evidence], with_depth: Sequence[Evidence]) -> list[Candidate]:
+def _scales(stated: Hypothesis, quick: Sequence[Evidence], with_depth: Sequence[Evidence]) -> list[Candidate]:
     """Scales of K, of focal lengths and of depth that serve best."""
-    found = _refined(SCALES, quick, lambda scale: scaled(asis, np.full(2, scale)))
-    found += _refined(SCALES, quick, partial(focal_scaled, asis))
+    found = _refined(SCALES, quick, lambda scale: scaled(stated, np.full(2, scale)))
+    found += _refined(SCALES, quick, partial(focal_scaled, stated))
     if with_depth:
-        found += _refined(DEPTH_SCALES, with_depth, partial(depth_scaled, asis))
+        found += _refined(DEPTH_SCALES, with_depth, partial(depth_scaled, stated))
     return found
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.diagnosis.board_fitting import (
+from lsmgeo.diagnosis.chessboards import (
     Pose,
     Seen,
     board_errors,
@@ -22,7 +22,7 @@ from lsmgeo.diagnosis.board_fitting import (
     transfer_errors,
 )
 from lsmgeo.diagnosis.findings import Cause, Check, Findings, Gap, counted
-from lsmgeo.diagnosis.geometry import scaling
+from lsmgeo.diagnosis.two_view_geometry import scaling
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -203,7 +203,7 @@ def held_back(model: Model, experiment: Experiment, folder: Folder) -> Iterator[
 def validate(model: Model, experiment: Experiment, folder: Folder) -> float:
     """The measure after all views on the shapes that training was evaluated on."""
     run, some = experiment.config(folder.set).run, held_back(model, experiment, folder)
-    found = evaluate_model(model, some, StopRequest(), region=run.region, loss=run.loss, pictures=0)
+    found = evaluate_model(model, some, StopRequest(), region=run.region, loss=run.loss, images=0)
     assert found is not None
     return found.value
 

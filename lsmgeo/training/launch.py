@@ -33,19 +33,19 @@ __all__ = [
     "any_true",
     "catch_stop",
     "check_agreement",
-    "decided",
     "fast_precision",
     "gather",
     "hold_folder",
     "ignore_stop",
     "make_model",
-    "started",
+    "resolve_config",
+    "start_accelerator",
 ]
 
 Item = TypeVar("Item")
 
 
-def decided(config: TrainingConfig, checkpoint: Checkpoint | None) -> TrainingConfig:
+def resolve_config(config: TrainingConfig, checkpoint: Checkpoint | None) -> TrainingConfig:
     """A configuration with what is left to the trainer filled in: as a run that goes on has it, else for this hardware.
 
     Args:
@@ -79,7 +79,7 @@ def fast_precision(device: str) -> str:
 
 
 @contextlib.contextmanager
-def started(run: RunConfig, *, has_idle_parameters: bool) -> Iterator[Accelerator]:
+def start_accelerator(run: RunConfig, *, has_idle_parameters: bool) -> Iterator[Accelerator]:
     """The processes of a run, as `torchrun` started them, or this one alone.
 
     Args:

@@ -69,9 +69,9 @@ class StepGuard:
 
     Example:
         >>> guard = StepGuard(in_a_row=2)
-        >>> guard.admits(1, is_bad=False), guard.admits(2, is_bad=True, names=("chair-0",))
+        >>> guard.check(1, is_bad=False), guard.check(2, is_bad=True, names=("chair-0",))
         (True, False)
-        >>> guard.admits(3, is_bad=True, names=("lamp-7",))
+        >>> guard.check(3, is_bad=True, names=("lamp-7",))
         Traceback (most recent call last):
             ...
         lsmgeo.errors.TrainingError: the loss or the gradient was not finite in 2 steps in succession; the parameters \
@@ -83,7 +83,7 @@ are unharmed. Last: step 2 with chair-0; step 3 with lamp-7
         self._state = {"steps": 0, "skipped": 0, "in_a_row": 0}
         self._last: list[str] = []
 
-    def admits(self, step: int, *, is_bad: bool, names: Sequence[str] = (), scale: float | None = None) -> bool:
+    def check(self, step: int, *, is_bad: bool, names: Sequence[str] = (), scale: float | None = None) -> bool:
         """Say whether a step may be taken.
 
         Args:

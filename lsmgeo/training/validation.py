@@ -69,7 +69,7 @@ class Evaluation:
 
 
 def evaluate_model(
-    model: nn.Module, batches: Iterator[Batch], stop: StopRequest, *, region: str, loss: str, pictures: int
+    model: nn.Module, batches: Iterator[Batch], stop: StopRequest, *, region: str, loss: str, images: int
 ) -> Evaluation | None:
     """Measure a model on batches, which together with those of the other processes are the whole set.
 
@@ -79,7 +79,7 @@ def evaluate_model(
         stop: when it is asked for, in whichever process, nothing is measured.
         region: of the loss of depth.
         loss: of voxels.
-        pictures: how many shapes to keep with what is predicted of them.
+        images: how many shapes to keep with what is predicted of them.
 
     Returns:
         What was found, in all processes the same but for the examples; None where a stop was asked for.
@@ -102,7 +102,7 @@ def evaluate_model(
                     measures.setdefault(view, DepthError()).update(of_view, batch.depth, names, batch.mask)
                 else:
                     measures.setdefault(view, VoxelIoU()).update(of_view, batch.occupancy, names)
-            for index in range(min(pictures - len(examples), len(predicted))):
+            for index in range(min(images - len(examples), len(predicted))):
                 examples.append(Example(_sample(batch, index), predicted[index].cpu()))
     if any_true(bool(stop)):
         return None

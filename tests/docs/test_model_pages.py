@@ -110,8 +110,8 @@ def test_every_report_has_its_command():
 
 
 def test_every_event_of_the_log_is_explained():
-    folder = ROOT / "lsmgeo" / "models" / "training"
-    source = "".join((folder / name).read_text(encoding="utf-8") for name in ("loop.py", "logs.py"))
+    folder = ROOT / "lsmgeo" / "training"
+    source = "".join((folder / name).read_text(encoding="utf-8") for name in ("loop.py", "run_state.py", "logs.py"))
     events = set(re.findall(r'\.event\(\s*"(\w+)"', source)) | set(re.findall(r'"(start|resume)"', source))
     assert len(events) > 6
     assert events <= set(re.findall(r"``(\w+)``", GUIDES["training"]))
@@ -121,7 +121,7 @@ def test_every_fault_is_a_test_that_exists():
     named = re.findall(r":fault:`(\w+\.py)::(\w+)`", GUIDES["training"])
     assert len(named) > 8
     for file, name in named:
-        tree = ast.parse((ROOT / "tests" / "models" / "training" / file).read_text(encoding="utf-8"))
+        tree = ast.parse((ROOT / "tests" / "training" / file).read_text(encoding="utf-8"))
         assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}, name
 
 

@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from lsmgeo.errors import CheckpointError, TrainingError
-from lsmgeo.training import RunConfig, loop, optim
+from lsmgeo.training import RunConfig, loop, optim, run_state
 from lsmgeo.training import logs as log_module
 from tests.training.faults import Points, fill, in_child, in_processes, kill, leftovers
 from tests.training.runs import (
@@ -53,7 +53,7 @@ def at_call(monkeypatch, owner, name: str, number: int, before: Callable[[], obj
 
 def during_save(monkeypatch, number: int, points: Points) -> None:
     """Count the points of a process's n-th save, from 1, alone."""
-    save, calls = loop.save_checkpoint, []
+    save, calls = run_state.save_checkpoint, []
 
     def replacement(*arguments, **options):
         calls.append(1)
@@ -62,7 +62,7 @@ def during_save(monkeypatch, number: int, points: Points) -> None:
         with points.counted():
             return save(*arguments, **options)
 
-    monkeypatch.setattr(loop, "save_checkpoint", replacement)
+    monkeypatch.setattr(run_state, "save_checkpoint", replacement)
 
 
 # F1: killed
@@ -153,7 +153,7 @@ def test_a_save_without_room_is_tried_again(config, whole, begun, monkeypatch, a
 def test_a_stop_right_after_a_failed_save_saves(config, whole, begun, monkeypatch):
     """The save that is due at step 4 fails, and the process is asked to stop at the same step."""
     with monkeypatch.context() as patch:
-        at_call(patch, loop, "save_checkpoint", 1, ask)
+        at_call(patch, run_state, "save_checkpoint", 1, ask)
         during_save(patch, 1, Points(fill, 0))
         with pytest.warns(UserWarning, match="the run goes on"):
             stopped = run(config, begun)
@@ -168,7 +168,7 @@ def test_a_stop_right_after_a_failed_save_saves(config, whole, begun, monkeypatc
 
 def test_a_stop_in_an_evaluation_puts_it_off(shards, whole, begun, monkeypatch):
     config = configure(shards, evaluate_every=4)
-    batches, calls = loop.validation_batches, []
+    batches, calls = run_state.validation_batches, []
 
     def asking(*arguments, **options):
         for batch in batches(*arguments, **options):
@@ -178,7 +178,7 @@ def test_a_stop_in_an_evaluation_puts_it_off(shards, whole, begun, monkeypatch):
             yield batch
 
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "validation_batches", asking)
+        patch.setattr(run_state, "validation_batches", asking)
         stopped = run(config, begun)
     assert (stopped.step, stopped.exit_code) == (4, 143)
     assert 4 not in [line["step"] for line in events(begun, "evaluation")]
@@ -199,7 +199,7 @@ def test_a_stop_in_a_save_ends_after_it(config, whole, begun, monkeypatch, at):
 
 
 def test_a_stop_while_waiting_for_data_does_not_wait(config, whole, begun, monkeypatch):
-    batches = loop.training_batches
+    batches = run_state.training_batches
 
     def slow(*arguments, **options):
         for number, batch in enumerate(batches(*arguments, **options), 1):
@@ -209,7 +209,7 @@ def test_a_stop_while_waiting_for_data_does_not_wait(config, whole, begun, monke
             yield batch
 
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "training_batches", slow)
+        patch.setattr(run_state, "training_batches", slow)
         stopped = run(config, begun)
     assert (stopped.step, stopped.exit_code) == (3, 143)
     run(config, begun)

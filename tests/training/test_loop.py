@@ -29,9 +29,9 @@ from lsmgeo.training import (
     RunConfig,
     TrainingConfig,
     launch,
-    loop,
     optim,
     read_config,
+    run_state,
 )
 from lsmgeo.training.batches import Need, open_shapes, training_batches, validation_batches
 from lsmgeo.training.checkpoints import load_latest
@@ -129,7 +129,7 @@ def test_what_a_run_leaves(shards, tmp_path):
     trained = run(config, tmp_path)
     assert (trained.step, trained.ended, trained.exit_code, trained.is_first) == (2, "steps", 0, True)
     assert trained.checkpoint == tmp_path / "checkpoints" / "step_00000002"
-    expected = launch.decided(config, None)
+    expected = launch.resolve_config(config, None)
     assert read_config(tmp_path / "config.json").to_dict() == expected.to_dict()
     assert [line["event"] for line in events(tmp_path)] == [
         *("start", "checkpoint", "step", "step", "evaluation", "checkpoint", "stop"),
@@ -226,7 +226,7 @@ def test_minutes_count_over_resumes(shards, tmp_path, monkeypatch):
     """A run on whose clock every look is a minute later; then the clock stands still."""
 
     def set_clock(now):
-        monkeypatch.setattr("lsmgeo.training.loop.time", mock.Mock(wraps=time, monotonic=now))
+        monkeypatch.setattr("lsmgeo.training.run_state.time", mock.Mock(wraps=time, monotonic=now))
 
     set_clock(itertools.count(1000.0, 60.0).__next__)
     run(configure(shards, steps=1), tmp_path)
@@ -252,13 +252,13 @@ def test_weights_to_begin_with(shards, plain, tmp_path):
 
 def test_a_run_that_another_process_began_meanwhile_is_left_alone(shards, tmp_path, monkeypatch):
     run(configure(shards, steps=2), tmp_path / "other")
-    make = loop.make_model
+    make = run_state.make_model
 
     def make_model(*arguments):
         shutil.copytree(tmp_path / "other", tmp_path / "run")
         return make(*arguments)
 
-    monkeypatch.setattr(loop, "make_model", make_model)
+    monkeypatch.setattr(run_state, "make_model", make_model)
     with pytest.raises(TrainingError, match="another process has trained in"):
         run(configure(shards, seed=9), tmp_path / "run")
     assert (tmp_path / "run" / "config.json").read_bytes() == (tmp_path / "other" / "config.json").read_bytes()
@@ -335,14 +335,14 @@ def test_what_is_left_to_the_trainer_is_decided_once(shards, tmp_path, monkeypat
     left = configure(shards, precision="auto")
     for has_amx, expected in ((False, "no"), (True, "bf16")):
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda has_amx=has_amx: {"amx_bf16": has_amx})
-        decided = launch.decided(left, None)
-        assert (decided.run.precision, decided.run.channels_last) == (expected, False)
+        resolved = launch.resolve_config(left, None)
+        assert (resolved.run.precision, resolved.run.channels_last) == (expected, False)
     run(configure(shards, steps=1, precision="auto"), tmp_path / "run")
     assert read_config(tmp_path / "run" / "config.json").run.precision == "bf16"
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": False})
     assert run(configure(shards, steps=2, precision="auto"), tmp_path / "run").step == 2
     r2n2 = dataclasses.replace(left, model=ModelConfig(name="r2n2", preset="tiny"))
-    assert launch.decided(r2n2, None).run.channels_last is True
+    assert launch.resolve_config(r2n2, None).run.channels_last is True
 
 
 def test_weights_say_what_they_reached(shards, tmp_path):

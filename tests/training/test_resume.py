@@ -18,7 +18,7 @@ import torch
 
 from lsmgeo.errors import CheckpointError
 from lsmgeo.models import create
-from lsmgeo.training import OptimiserConfig, TrainingConfig, loop, read_config
+from lsmgeo.training import OptimiserConfig, TrainingConfig, loop, read_config, run_state
 from lsmgeo.training.checkpoints import load_latest
 from tests.training.runs import (
     assert_same_end,
@@ -82,7 +82,7 @@ def test_nothing_is_drawn_from_generators_of_all(shards, whole, begun, monkeypat
 
     Its first checkpoint is of an earlier version, which did save it.
     """
-    find, save, seeds = loop.find_gradients, loop.save_checkpoint, itertools.count(100)
+    find, save, seeds = loop.find_gradients, run_state.save_checkpoint, itertools.count(100)
 
     def find_gradients(*arguments, **options):
         seed = next(seeds)
@@ -96,7 +96,7 @@ def test_nothing_is_drawn_from_generators_of_all(shards, whole, begun, monkeypat
         return save(*arguments, state=state, **options)
 
     monkeypatch.setattr(loop, "find_gradients", find_gradients)
-    monkeypatch.setattr(loop, "save_checkpoint", save_checkpoint)
+    monkeypatch.setattr(run_state, "save_checkpoint", save_checkpoint)
     with monkeypatch.context() as patch:
         stop_in(patch, 2)
         assert run(configure(shards), begun).step == 4
@@ -195,9 +195,9 @@ def cpu_clock(second: float = 1.0, *, is_new: bool = True):
         return wrapped
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop, "time", mock.Mock(wraps=time, process_time=lambda: now[0]))
+        patch.setattr(run_state, "time", mock.Mock(wraps=time, process_time=lambda: now[0]))
         patch.setattr(loop, "find_gradients", takes(second, loop.find_gradients, slow=5 if is_new else 0))
-        patch.setattr(loop, "evaluate_model", takes(4.0, loop.evaluate_model, slow=1))
+        patch.setattr(run_state, "evaluate_model", takes(4.0, run_state.evaluate_model, slow=1))
         yield
 
 

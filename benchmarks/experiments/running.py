@@ -129,7 +129,7 @@ def evaluate_test(experiment: Experiment, model: Model, validation: dict[str, An
         return {"data": about, "depth_error": depth_by_views(model, shapes.at(model.image_size))}
     by_threshold = validation.get("iou by threshold", {"0.4": 0.0})
     threshold = float(max(by_threshold, key=lambda level: by_threshold[level]))
-    method = evaluation.Contender(model.name, model)
+    method = evaluation.Method(model.name, model)
     options = evaluation.Options(threshold=threshold, progress=True)
     iou, categories = evaluation.evaluate([method], shapes, "iou", replace(options, views=VIEWS)).tables[:2]
     rows = [row for row in iou.rows if not row.is_elsewhere]

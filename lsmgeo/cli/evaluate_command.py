@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import sys
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 __all__ = ["evaluate"]
 
 
 def evaluate(
     checkpoints: str,
-    report: Literal[
-        "auto", "iou", "backgrounds", "unseen", "pose-noise", "order", "sequences", "depth", "clouds"
-    ] = "auto",
+    report: str = "auto",
     shards: str | None = None,
     shapes: int | None = None,
     views: int | None = None,
@@ -27,52 +26,52 @@ def evaluate(
     split: Literal["test", "val", "train"] = "test",
     device: Literal["auto", "cpu", "cuda"] = "auto",
 ) -> int:
-    """Make a table or figure of the paper from trained models: printed, and written as JSON, CSV and pictures.
+    """Make a table or figure of the paper from trained models: printed, and written as JSON, CSV and images.
 
-    Every figure takes its models in one list; what each of them is and was trained on stands in its file. The data are
-    the test shapes of shards, or of synthetic-13, which are rendered as they are needed.
+    The shapes are the test shapes of shards, or of synthetic-13, which are rendered on demand. How a model was trained
+    is read from its file.
 
     Args:
-        checkpoints: files of weights, checkpoints or run folders of lsmgeo train, with commas between, each PATH or
-            NAME=PATH, such as runs/vlsm,R2N2=runs/r2n2.
-        report: "iou" is voxel IoU by views and categories beside visual hulls (tables 1, 3, 4), "backgrounds" that in
-            front of white and of other backgrounds, "unseen" its drop on categories that were not trained on (it takes
-            models trained on all, the first and the second categories), "pose-noise" its curve over wrong poses,
-            "order" its spread over orders of the views, "sequences" pictures after each view; of depth models,
-            "depth" is the error beside plane sweep's (table 5) and "clouds" shaded depth and point clouds. "auto" is
+        checkpoints: weights, checkpoints or run folders of lsmgeo train, separated by commas, each PATH or NAME=PATH,
+            such as runs/vlsm,R2N2=runs/r2n2.
+        report: for voxel models, "iou": IoU by views and categories, with visual hulls (tables 1, 3, 4);
+            "backgrounds": IoU on white and other backgrounds; "unseen": its drop on categories that were not trained on
+            (for models trained on all, the first and the second categories); "pose-noise": IoU by the noise of poses;
+            "order": its spread over orders of the views; "sequences": images after each view. For depth models,
+            "depth": the error, with that of plane sweep (table 5); "clouds": shaded depth and point clouds. "auto" is
             iou or depth.
-        shards: a folder of shards, as lsmgeo render and lsmgeo convert make them; by default synthetic-13.
-        shapes: how many, from the categories in turn; by default all of the shards, 130 of synthetic-13, and fewer
-            where every shape is drawn (sequences 13, clouds 3) or it takes long (depth 26).
-        views: the largest number of views; by default what the paper has: 8, 4 for backgrounds, pose-noise and
-            sequences, 10 for depth, 20 for clouds.
-        out: folder for the results; created where it does not exist.
-        seed: decides the order of views, and noise.
+        shards: a folder of shards, from lsmgeo render or lsmgeo convert; by default synthetic-13.
+        shapes: their number, from the categories in turn; by default all of the shards, 130 of synthetic-13, and fewer
+            where every shape is drawn (sequences 13, clouds 3) or measuring takes long (depth 26).
+        views: the largest number of views; by default as in the paper: 8, 4 for backgrounds, pose-noise and sequences,
+            10 for depth, 20 for clouds.
+        out: folder for the results; created if it does not exist.
+        seed: of the order of views and of noise.
         batch: shapes at a time.
         threshold: of probabilities, for IoU.
-        background: for backgrounds, what stands behind: random, or a folder of pictures.
-        degrees: for pose-noise, the largest angles, with commas between.
-        orders: for order, how many.
-        planes: for depth and clouds, of the plane sweep.
+        background: for backgrounds: random, or a folder of images.
+        degrees: for pose-noise, the largest angles, separated by commas.
+        orders: for order, the number of orders.
+        planes: for depth and clouds, the number of planes of the plane sweep.
         split: the part of the set.
-        device: auto takes a GPU where there is one.
+        device: auto is a GPU where there is one.
 
     Returns:
         The exit status.
     """
     import time
-    from pathlib import Path
 
     import torch
 
     from lsmgeo import evaluation
+    from lsmgeo._checks import check_choice
     from lsmgeo.errors import OptionError
-    from lsmgeo.evaluation.evaluate import FEW
 
+    check_choice("evaluate", "report", report, ("auto", *evaluation.REPORTS))
     try:
         angles = tuple(float(angle) for angle in degrees.split(","))
     except ValueError:
-        raise OptionError(f"degrees must be numbers with commas between, such as 0,10,20; got {degrees!r}") from None
+        raise OptionError(f"degrees must be numbers separated by commas, such as 0,10,20; got {degrees!r}") from None
     options = evaluation.Options(
         views=views,
         threshold=threshold,
@@ -85,27 +84,30 @@ def evaluate(
         progress=True,
     )
     start = time.perf_counter()
-    place = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
-    contenders = evaluation.open_contenders(checkpoints, place)
-    if report == "auto":
-        report = "depth" if contenders[0].has_depth else "iou"
-    found = evaluation.open_shapes(
-        shards,
-        size=max(contender.size for contender in contenders),
-        shapes=FEW.get(report) if shapes is None else shapes,
-        seed=seed,
-        split=split,
+    methods = evaluation.open_methods(
+        checkpoints, ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
     )
-    made = evaluation.evaluate(contenders, found, report, options)
+    if report == "auto":
+        report = "depth" if methods[0].has_depth else "iou"
+    if shapes is None:
+        shapes = evaluation.REPORTS[report].shapes
+    size = max(method.size for method in methods)
+    found = evaluation.open_shapes(shards, size=size, shapes=shapes, seed=seed, split=split)
+    made = evaluation.evaluate(methods, found, report, options)
     print(f"data:     {found.about}" + ("" if shards is None else f", {Path(shards).resolve()}"))
-    for contender in contenders:
-        print(f"model:    {contender.name}, {contender.path}")
-    for table in made.tables:
-        print(f"\n{evaluation.format_table(table)}")
-    written = evaluation.write_report(made, out)
-    kinds = sorted({path.suffix[1:].upper() for path in written})
-    print(f"\ntime:     {time.perf_counter() - start:.1f} s")
-    print(f"written:  {len(written)} files ({', '.join(kinds)}) in {Path(out).resolve()}")
-    for note in made.notes:
-        print(f"lsmgeo: warning: {note}", file=sys.stderr)
+    for method in methods:
+        print(f"model:    {method.name}, {method.path}")
+    _print_report(made, evaluation.write_report(made, out), Path(out), time.perf_counter() - start)
     return 0
+
+
+def _print_report(report: Any, written: list[Path], out: Path, seconds: float) -> None:
+    from lsmgeo.evaluation import format_table
+
+    for table in report.tables:
+        print(f"\n{format_table(table)}")
+    kinds = sorted({path.suffix[1:].upper() for path in written})
+    print(f"\ntime:     {seconds:.1f} s")
+    print(f"written:  {len(written)} files ({', '.join(kinds)}) in {out.resolve()}")
+    for note in report.notes:
+        print(f"lsmgeo: warning: {note}", file=sys.stderr)

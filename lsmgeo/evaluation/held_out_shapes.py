@@ -1,4 +1,4 @@
-"""What is evaluated on: the test shapes of shards, or of synthetic-13, rendered when they are asked for."""
+"""The shapes that models are tested on: those of shards, or of synthetic-13, rendered on demand."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from lsmgeo.scenes import synthetic13
 
 __all__ = ["Shapes", "batches", "generator_of", "noise_of", "open_shapes"]
 
-# What the numbers of a shape are drawn for: the order of its views, what stands behind it, the noise of its poses.
-ORDER, BEHIND, NOISE = range(3)
-# Of a set without an end, how many shapes are taken unless told.
+# The uses of the random numbers of a shape: the order of its views, its background, the noise of its poses.
+ORDER, BACKGROUND, NOISE = range(3)
+# The default number of shapes of an endless set.
 SHAPES = 130
 
 
 def generator_of(seed: int, name: str, use: int) -> np.random.Generator:
-    """Random numbers that belong to one shape and one use, whatever else is evaluated."""
+    """Random numbers for one shape and one use; they do not depend on the other shapes."""
     digest = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "little")
     return np.random.default_rng(np.random.SeedSequence([seed, digest, use]))
 
 
 def noise_of(seed: int, name: str) -> torch.Generator:
-    """The same for noise that torch draws."""
+    """The same for the noise of poses, which torch draws."""
     drawn = int(np.random.SeedSequence([int(generator_of(seed, name, NOISE).integers(2**32)), 0]).generate_state(1)[0])
     return torch.Generator().manual_seed(drawn)
 
 
 def view_order(seed: int, name: str, there: int) -> list[int]:
-    """All views of a shape in its order."""
+    """All views of a shape in a random order."""
     # The sorting of uniform numbers is the same in all versions of numpy.
     order: list[int] = np.argsort(generator_of(seed, name, ORDER).random(there), kind="stable").tolist()
     return order
@@ -48,14 +48,14 @@ def view_order(seed: int, name: str, there: int) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """Shapes by number, each with views in an order that follows from the seed and its name alone.
+    """Shapes by number, each with its views in an order that depends only on the seed and its name.
 
     Attributes:
-        source: the set that they are of.
-        indices: which of its shapes.
-        seed: what orders and noise are drawn from.
-        about: where the shapes come from, in words.
-        size: height and width of pictures, silhouettes and depth, as in training; None for the source's own.
+        source: the set of shapes.
+        indices: the shapes of the set that are used.
+        seed: of orders and noise.
+        about: a description for reports.
+        size: height and width of images, silhouettes and depth, as in training; None for those of the set.
     """
 
     source: ShapeSet
@@ -66,13 +66,13 @@ class Shapes:
 
     @property
     def categories(self) -> list[str]:
-        """The category of each."""
+        """The category of each shape."""
         categories = self.source.categories
         return [categories[index] or "all" for index in self.indices]
 
     @property
     def most_views(self) -> int:
-        """The views that every shape has."""
+        """The number of views that every shape has at least."""
         return int(self.source.view_counts[list(self.indices)].min())
 
     def __len__(self) -> int:
@@ -90,11 +90,11 @@ class Shapes:
         """One shape with its first views.
 
         Args:
-            index: which shape.
-            views: how many.
-            resolution: voxels a side of the occupancy; None for none.
-            depth: whether depth is wanted.
-            background: what stands behind the object.
+            index: the number of the shape.
+            views: the number of views.
+            resolution: voxels along a side of the occupancy; None to leave it out.
+            depth: whether to read depth.
+            background: the background of the object.
         """
         shape = self.indices[index]
         name = self.source.names[shape]
@@ -104,7 +104,7 @@ class Shapes:
             depth=depth,
             occupancy=resolution,
             background=background,
-            generator=generator_of(self.seed, name, BEHIND),
+            generator=generator_of(self.seed, name, BACKGROUND),
         )
         return sample if self.size is None else resize_sample(sample, self.size)
 
@@ -118,18 +118,18 @@ def open_shapes(
     split: str = "test",
     categories: Sequence[str] | None = None,
 ) -> Shapes:
-    """Open what is evaluated on.
+    """Open the shapes to test on.
 
     Args:
         shards: a folder of shards, or None for synthetic-13.
-        size: of the pictures that are rendered; those of shards have their own.
-        shapes: how many, taken from the categories in turn; by default all of the shards, or 130.
+        size: of rendered images; those of shards keep theirs.
+        shapes: their number, taken from the categories in turn; by default all of the shards, or 130.
         seed: of the order of views, at least 0.
         split: the part of the set.
-        categories: these alone; None for all.
+        categories: only these; None for all.
 
     Raises:
-        OptionError: no shape is left, or an option that is none.
+        OptionError: no shape is left, or an invalid option.
         DataError: the shards cannot be read.
     """
     seed = check_whole("evaluate", "seed", seed, 0, 2**32 - 1)
@@ -148,19 +148,19 @@ def open_shapes(
     if not wanted:
         raise OptionError(f"evaluate: no shape of {shards} is of the split {split!r} and the categories {categories}")
     taken = _in_turn(wanted, [names[index] for index in wanted])[:number]
-    # Where the folder lies says nothing in a picture.
+    # The name without the path, which says nothing in a figure.
     return Shapes(there, taken, seed, f"{len(taken)} shapes of {there.folder.resolve().name}")
 
 
 def _synthetic_numbers(count: int, split: str, categories: Sequence[str] | None) -> list[int]:
-    synthetic_numbers(split, categories)  # refuses a category that there is not
+    synthetic_numbers(split, categories)  # raises on an unknown category
     kept = [name for name in synthetic13.CATEGORIES if categories is None or name in categories]
     turns = zip(*(synthetic_numbers(split, (name,)) for name in kept), strict=True)
     return list(itertools.islice(itertools.chain.from_iterable(turns), count))
 
 
 def _in_turn(indices: Sequence[int], categories: Sequence[str]) -> list[int]:
-    """Indices reordered so that the categories take turns: any first part has about as many of each."""
+    """Indices reordered so that the categories alternate: any first part has about as many of each."""
     rounds: dict[str, int] = {}
     keyed = []
     for index, category in zip(indices, categories, strict=True):
@@ -179,15 +179,15 @@ def batches(
     background: Background = "white",
     progress: bool = False,
 ) -> Iterator[Batch]:
-    """All shapes, some at a time, with a progress bar.
+    """All shapes in batches, with a progress bar.
 
     Args:
         shapes: from `open_shapes`.
-        views: of each.
+        views: of each shape.
         batch: shapes at a time.
-        resolution: voxels a side of the truth; None for none.
-        depth: whether depth is wanted.
-        background: what stands behind the objects.
+        resolution: voxels along a side of the true occupancy; None to leave it out.
+        depth: whether to read depth.
+        background: the background of the objects.
         progress: whether to show the bar (on a terminal).
     """
     from tqdm import tqdm

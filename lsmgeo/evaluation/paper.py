@@ -1,7 +1,6 @@
-"""The figures of the paper, for its own data: Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017.
+"""The numbers of the paper: Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017.
 
-ShapeNet, its own renderings and its own split: beside figures of other data they say how far a method goes there, no
-more.
+They are for its own renderings and split of ShapeNet, and are not comparable with numbers for other data.
 """
 
 from __future__ import annotations
@@ -40,23 +39,23 @@ IOU_OF_CATEGORIES = {
         (62.0, 53.0, 69.7, 80.6, 57.7, 55.1, 44.5, 63.5, 61.6, 66.3, 58.8, 74.3, 59.5, 62.1),
     ),
 }
-"""Tables 3 and 4: the same of the categories and their mean, with 1, 2, 3, 4 views."""
+"""Tables 3 and 4: the same by category and, last, their mean, with 1, 2, 3, 4 views."""
 
 DEPTH = {
     "plane sweep": (0.029, 0.047, 0.074, 0.043, 0.054, 0.079, 0.043, 0.068, 0.023, 0.066, 0.054, 0.041, 0.043, 0.051),
     "D-LSM": (0.024, 0.030, 0.022, 0.016, 0.023, 0.028, 0.027, 0.029, 0.023, 0.021, 0.025, 0.021, 0.027, 0.024),
 }
-"""Table 5: median depth error of the categories and their mean, 10 views, world units (the caption says mean L1)."""
+"""Table 5: median depth error by category and, last, their mean, 10 views, world units (the caption says mean L1)."""
 
 
 def paper_row(name: str, numbers: Sequence[float], length: int) -> Row:
-    """A line with the paper's figures, filled up to a length."""
+    """A row with the paper's numbers, padded to a length."""
     cells: list[Cell | None] = [Cell(number) for number in numbers[:length]]
     return Row(f"paper, {name}", [*cells, *[None] * (length - len(cells))], True)
 
 
 def paper_categories(name: str, numbers: Sequence[float], categories: Sequence[str]) -> Row:
-    """A line with the paper's figures of some categories and, last, of all."""
+    """A row with the paper's numbers for some categories and, last, for all."""
     known = dict(zip(CATEGORIES, numbers, strict=False))
     cells = [Cell(known[category]) if category in known else None for category in categories]
     return Row(f"paper, {name}", [*cells, Cell(numbers[-1])], True)

@@ -1,4 +1,4 @@
-"""Curves of reports, as PNG."""
+"""The figures of reports, as PNG: curves, and sheets of images."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lsmgeo.evaluation.report import Cell
 __all__ = ["Curve", "draw_curves", "sheet"]
 
 DPI = 110
-# Of a sheet, in pixels: between pictures, left of the names, and above the pictures.
+# Margins of a sheet in pixels: between images, left of the names, and above the images.
 GAP, NAMES, TOP = 4, 16, 46
 COLOURS = ("#1f5fa8", "#c8553d", "#3f8f5a", "#8b5fbf", "#d29a1a", "#4aa3b5", "#7a7a7a", "#b04a8a")
 
@@ -23,7 +23,7 @@ class Curve(NamedTuple):
     name: str
     places: Sequence[float]
     cells: Sequence[Cell]
-    is_elsewhere: bool = False  # the paper's, of other data
+    is_elsewhere: bool = False  # the paper's, on other data
 
 
 def draw_curves(
@@ -35,15 +35,15 @@ def draw_curves(
     up: str,
     bars: str = "two standard errors",
 ) -> bytes:
-    """Draw lines with bars of two errors up and down; those of other data are thin and broken.
+    """Draw curves with error bars of two standard errors; those of other data are thin and dashed.
 
     Args:
-        curves: the lines; one of other data has the colour of the one of that name.
-        title: to write above.
-        data: what was measured on, written below the title.
-        across: what the places are, with units.
-        up: what the values are, with units.
-        bars: what the bars are, where there are any.
+        curves: the curves; one of other data has the colour of the curve of the same name.
+        title: the title.
+        data: the data that was measured on, below the title.
+        across: the label of the x axis, with units.
+        up: the label of the y axis, with units.
+        bars: the meaning of the error bars, if there are any.
     """
     figure = new_figure(7.0, 4.2, dpi=DPI)
     axes = figure.add_subplot()
@@ -79,17 +79,17 @@ def sheet(
     *,
     title: str,
 ) -> bytes:
-    """Draw pictures of one size in rows and columns with names beside and above.
+    """Draw images of one size in rows and columns with their names.
 
     Args:
-        rows: of pictures; None leaves a place empty.
-        names: of the rows, one each.
-        columns: of the columns, one each.
-        title: to write above.
+        rows: rows of images; None leaves a cell empty.
+        names: of the rows.
+        columns: names of the columns.
+        title: the title.
     """
     pixels = tile(rows, gap=GAP)
-    side = next(picture for row in rows for picture in row if picture is not None).shape[0]
-    margin = NAMES + 7 * max(len(name) for name in names)  # pixels, of letters about so wide
+    side = next(image for row in rows for image in row if image is not None).shape[0]
+    margin = NAMES + 7 * max(len(name) for name in names)  # pixels; a letter is about 7 wide
     width, height = margin + pixels.shape[1] + GAP, TOP + pixels.shape[0] + GAP
     figure = new_figure(width / 100, height / 100, layout="none")
     figure.text(margin / width, 1 - 14 / height, title, fontsize=10, va="center")
@@ -99,6 +99,6 @@ def sheet(
     for place, name in enumerate(columns):
         middle = margin + place * (side + GAP) + side / 2
         figure.text(middle / width, 1 - (TOP - 10) / height, name, fontsize=8, ha="center", va="center")
-    # Pixel for pixel, from the lower left corner.
+    # At its own resolution, from the lower left corner.
     figure.figimage(pixels, margin, GAP, origin="upper")
     return as_png(figure)

@@ -1,50 +1,46 @@
-"""The last line of table 1: voxel IoU in front of white and of random backgrounds."""
+"""The last line of table 1: voxel IoU on white and on random backgrounds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from lsmgeo.evaluation.held_out_shapes import Shapes
-from lsmgeo.evaluation.methods import Contender
-from lsmgeo.evaluation.options import Options
+from lsmgeo.evaluation.methods import Method, Options
 from lsmgeo.evaluation.paper import IOU, paper_row
 from lsmgeo.evaluation.plots import Curve, draw_curves
-from lsmgeo.evaluation.report import Report, Row, Table
+from lsmgeo.evaluation.report import Report, Row, Scores, Table, joined
 from lsmgeo.evaluation.report_iou import measure_iou
-from lsmgeo.evaluation.scores import Scores, joined
 
 __all__ = ["report_backgrounds"]
 
 PAPER = ("V-LSM", "V-LSM w/bg")
 
 
-def report_backgrounds(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
-    """Measure IoU of every model in front of white and in front of `options.background`.
+def report_backgrounds(methods: Sequence[Method], shapes: Shapes, views: int, options: Options) -> Report:
+    """Measure IoU of every model on a white background and on `options.background`.
 
-    The paper trains and tests "V-LSM w/bg" on random images as backgrounds; a model that was trained on white alone
-    shows what that is good for.
+    The paper trains and tests "V-LSM w/bg" on random images as backgrounds; a model that was trained on white only
+    shows the gain.
 
     Args:
-        contenders: voxel models of one resolution.
-        shapes: what is evaluated on.
+        methods: voxel models of one resolution.
+        shapes: the shapes to test on.
         views: 4 in the paper.
         options: background, threshold, batch.
 
     Returns:
-        Table "views" with two lines a model.
+        Table "views" with two rows per model.
 
     Raises:
         OptionError: models of different resolutions.
     """
     backgrounds = {"white": "white", "random": options.background}
     measured = {
-        words: measure_iou(contenders, shapes, views, options, hulls=False, background=background)
+        words: measure_iou(methods, shapes, views, options, hulls=False, background=background)
         for words, background in backgrounds.items()
     }
     scores: dict[str, Scores] = {
-        f"{contender.name}, {words} behind": measured[words][contender.name]
-        for contender in contenders
-        for words in backgrounds
+        f"{method.name}, {words} behind": measured[words][method.name] for method in methods for words in backgrounds
     }
     rows = [Row(name, one.cells(100)) for name, one in scores.items()]
     rows += [paper_row(name, IOU[name], views) for name in PAPER]

@@ -1,4 +1,4 @@
-"""The figures of depth: D-LSM beside plane sweep with 5, 10 and 20 views, as shaded depth and as joint point clouds."""
+"""The figures of depth: D-LSM and plane sweep with 5, 10 and 20 views, as shaded depth and as joint point clouds."""
 
 from __future__ import annotations
 
@@ -15,11 +15,9 @@ from lsmgeo.data.sample import first_views
 from lsmgeo.drawing import Picture, as_pixels, draw_depth, draw_points
 from lsmgeo.evaluation.baselines import SWEEP, sweep_views
 from lsmgeo.evaluation.held_out_shapes import Shapes, batches
-from lsmgeo.evaluation.methods import Contender, shared
-from lsmgeo.evaluation.options import Options
+from lsmgeo.evaluation.methods import Method, Options, shared
 from lsmgeo.evaluation.plots import sheet
-from lsmgeo.evaluation.report import Cell, Report, Row, Table
-from lsmgeo.evaluation.scores import means_of
+from lsmgeo.evaluation.report import Cell, Report, Row, Table, means_of
 from lsmgeo.metrics import depth_errors, point_cloud_scores
 
 __all__ = ["joint_cloud", "report_clouds"]
@@ -27,56 +25,54 @@ __all__ = ["joint_cloud", "report_clouds"]
 COUNTS = (5, 10, 20)
 SIDE = 160
 TRUTH = "truth"
-# The nearness that counts in the F-score, world units: about half a voxel of 32.
+# The distance threshold of the F-score, world units: about half a voxel of a grid of 32.
 NEAR = 0.015
 
 
-def report_clouds(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
-    """Draw depth maps, shaded from a shifted viewpoint, and the clouds of all views together.
+def report_clouds(methods: Sequence[Method], shapes: Shapes, views: int, options: Options) -> Report:
+    """Draw shaded depth maps from a shifted viewpoint, and the points of all views together.
 
-    Of each depth map the object's pixels are taken, by the silhouettes, for both methods (plane sweep has no depth at
-    some of them). Kar et al. 2017, figures 4 and 5.
+    Depth maps of all methods are cut by the silhouettes (plane sweep has no depth at some pixels of the object).
+    Kar et al. 2017, figures 4 and 5.
 
     Args:
-        contenders: depth models of one size of images.
-        shapes: all of which are drawn.
+        methods: depth models of one size of images.
+        shapes: the shapes to test on; all are drawn.
         views: the largest number, 20 in the paper.
         options: planes, window.
 
     Returns:
-        A picture a shape and a PLY file for each cloud; a table of the mean depth error and of the cloud's F-score
-        against the cloud of the true depths.
+        A figure per shape and a PLY file per cloud; tables of the mean depth error and of the F-score of the cloud
+        against that of the true depth.
 
     Raises:
         OptionError: models of different sizes.
     """
-    size = shared(contenders, "size")
+    size = shared(methods, "size")
     counts = [count for count in COUNTS if count < views] + [views]
-    pictures, clouds, measured = {}, {}, []
-    methods = (SWEEP, *(contender.name for contender in contenders))
+    figures, clouds, measured = {}, {}, []
+    names = (SWEEP, *(method.name for method in methods))
     for batch in batches(shapes.at(size), views, 1, resolution=None, depth=True, progress=options.progress):
         shape = batch.name[0]
         found = {
-            (name, count): depth
-            for count in counts
-            for name, depth in _depths(contenders, batch, count, options).items()
+            (name, count): depth for count in counts for name, depth in _depths(methods, batch, count, options).items()
         }
         assert batch.depth is not None
         assert batch.mask is not None
         found |= {(TRUTH, count): batch.depth[0, :count] for count in counts}
         found = {key: torch.where(batch.mask[0, : key[1]], depth, 0.0) for key, depth in found.items()}
         joint = {key: joint_cloud(depth, batch.images[0], select(batch.cameras, 0, 0)) for key, depth in found.items()}
-        pictures[f"clouds-{_file(shape)}"] = _draw(shape, batch, counts, (TRUTH, *methods), found, joint)
+        figures[f"clouds-{_file(shape)}"] = _draw(shape, batch, counts, (TRUTH, *names), found, joint)
         for (name, count), cloud in joint.items():
             clouds[f"clouds-{_file(shape)}-{_file(name)}-{count}"] = cloud
-        for name in methods:
+        for name in names:
             for count in counts:
                 error = depth_errors(found[name, count], batch.depth[0, :count]).l1.nanmean()
                 scores = point_cloud_scores(joint[name, count][0], joint[TRUTH, count][0], NEAR, cell=NEAR / 2)
                 measured.append((shape, name, count, float(error), scores.f_score))
     columns = [str(count) for count in counts]
     tables = [
-        Table(key, title, columns, [Row(name, _means(measured, name, counts, place)) for name in methods], digits)
+        Table(key, title, columns, [Row(name, _means(measured, name, counts, place)) for name in names], digits)
         for key, title, place, digits in (
             ("error", "mean depth error [world units], views:", 3, 4),
             ("f-score", f"F-score of the cloud at {NEAR}, views:", 4, 3),
@@ -87,18 +83,18 @@ def report_clouds(contenders: Sequence[Contender], shapes: Shapes, views: int, o
         dict(zip(("name", "method", "views", "mean depth error", "f_score"), numbers, strict=True))
         for numbers in measured
     ]
-    return Report("clouds", tables, facts, by_shape, pictures, clouds)
+    return Report("clouds", tables, facts, by_shape, figures, clouds)
 
 
-def _depths(contenders: Sequence[Contender], batch: Batch, count: int, options: Options) -> dict[str, Tensor]:
+def _depths(methods: Sequence[Method], batch: Batch, count: int, options: Options) -> dict[str, Tensor]:
     """Depth (count, H, W) of every method from the first views of one shape."""
     images, cameras = batch.images[:, :count], first_views(batch.cameras, count)
     swept = sweep_views(images[0], select(cameras, 0, 0), planes=options.planes, window=options.window).depth
-    return {SWEEP: swept} | {one.name: one.depths(images, cameras)[0] for one in contenders}
+    return {SWEEP: swept} | {one.name: one.depths(images, cameras)[0] for one in methods}
 
 
 def joint_cloud(depth: Tensor, images: Tensor, cameras: CameraTensors) -> tuple[np.ndarray, np.ndarray]:
-    """The points (N, 3) of all depth maps (V, H, W) where there is depth, and their colours (N, 3) uint8.
+    """The points (N, 3) of all pixels with depth, and their colours (N, 3) uint8.
 
     Args:
         depth: (V, H, W) camera z, 0 where there is none.
@@ -107,9 +103,9 @@ def joint_cloud(depth: Tensor, images: Tensor, cameras: CameraTensors) -> tuple[
     """
     positions, colours = [], []
     for view, one in enumerate(depth):
-        there = one > 0
-        positions.append(points_of(one, select(cameras, 0, view))[there])
-        colours.append(as_pixels(images[view])[there])
+        has_depth = one > 0
+        positions.append(points_of(one, select(cameras, 0, view))[has_depth])
+        colours.append(as_pixels(images[view])[has_depth])
     return torch.cat(positions).numpy(), np.concatenate(colours)
 
 
@@ -126,7 +122,7 @@ def _draw(
     for name in methods:
         shaded: list[Picture | None] = [draw_depth(depths[name, count][0], camera, size=SIDE) for count in counts]
         if name == TRUTH:
-            shaded[1:] = [None] * len(shaded[1:])  # the first view's is the same
+            shaded[1:] = [None] * len(shaded[1:])  # it does not depend on the number of views
         drawn = [draw_points(*clouds[name, count], size=SIDE) for count in counts]
         rows.append([as_pixels(batch.images[0, 0], SIDE) if name == TRUTH else None, *shaded, *drawn])
     columns = ["first view"]
@@ -142,5 +138,5 @@ def _means(
 
 
 def _file(name: str) -> str:
-    """A name as files may have it."""
+    """A name in characters that are valid in names of files."""
     return "".join(letter if letter.isalnum() or letter in "-." else "_" for letter in name)

@@ -7,44 +7,42 @@ from collections.abc import Mapping, Sequence
 from lsmgeo.data.shards.background_sources import Background
 from lsmgeo.evaluation.baselines import HULL, STRICT_HULL, hull_iou
 from lsmgeo.evaluation.held_out_shapes import Shapes, batches
-from lsmgeo.evaluation.methods import Contender, shared
-from lsmgeo.evaluation.options import Options
+from lsmgeo.evaluation.methods import Method, Options, shared
 from lsmgeo.evaluation.paper import IOU, IOU_OF_CATEGORIES, paper_categories, paper_row
 from lsmgeo.evaluation.plots import Curve, draw_curves
-from lsmgeo.evaluation.report import Cell, Report, Row, Table
-from lsmgeo.evaluation.scores import Scores, iou_by_view, joined
+from lsmgeo.evaluation.report import Cell, Report, Row, Scores, Table, iou_by_view, joined
 
 __all__ = ["measure_iou", "report_iou", "table_of_views"]
 
 HULL_FALLS = "The 0.75 hull drops from 4 to 5 views because it needs all of 4 silhouettes, but only 4 of 5."
 
 
-def report_iou(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
-    """Measure IoU after 1, 2, ... views: the mean of the categories, and every category.
+def report_iou(methods: Sequence[Method], shapes: Shapes, views: int, options: Options) -> Report:
+    """Measure IoU after 1, 2, ... views: the mean over categories, and every category.
 
     Args:
-        contenders: voxel models of one resolution.
-        shapes: what is evaluated on.
+        methods: voxel models of one resolution.
+        shapes: the shapes to test on.
         views: 8 in the paper.
         options: threshold, batch.
 
     Returns:
-        Table "views", and one a model of the categories; a picture of the curves.
+        Table "views", a table of the categories per model, and a figure of the curves.
 
     Raises:
         OptionError: models of different resolutions.
     """
-    scores = measure_iou(contenders, shapes, views, options, hulls=True)
-    table = table_of_views("voxel IoU [%], views:", scores, views, _known(contenders))
+    scores = measure_iou(methods, shapes, views, options, hulls=True)
+    table = table_of_views("voxel IoU [%], views:", scores, views, _known(methods))
     categories = sorted(set(shapes.categories))
-    classes = [_table_of_categories(one, scores[one.name], categories) for one in contenders]
+    classes = [_table_of_categories(one, scores[one.name], categories) for one in methods]
     places = range(1, views + 1)
     curves = [Curve(name, places, one.cells(100)) for name, one in scores.items()]
     curves += [
         Curve(name, places[: len(IOU[paper])], [Cell(number) for number in IOU[paper][:views]], True)
-        for name, paper in _known(contenders).items()
+        for name, paper in _known(methods).items()
     ]
-    picture = draw_curves(
+    figure = draw_curves(
         curves, title="Voxel IoU by number of views", data=shapes.about, across="views", up="mean IoU of categories [%]"
     )
     return Report(
@@ -52,12 +50,12 @@ def report_iou(contenders: Sequence[Contender], shapes: Shapes, views: int, opti
         [table, *classes],
         {"views": views, "threshold": options.threshold},
         joined(scores, "iou"),
-        {"iou": picture},
+        {"iou": figure},
     )
 
 
 def measure_iou(
-    contenders: Sequence[Contender],
+    methods: Sequence[Method],
     shapes: Shapes,
     views: int,
     options: Options,
@@ -68,24 +66,24 @@ def measure_iou(
     """IoU of every shape after every view, by method.
 
     Args:
-        contenders: voxel models of one resolution.
-        shapes: what is evaluated on.
-        views: how many.
+        methods: voxel models of one resolution.
+        shapes: the shapes to test on.
+        views: their number.
         options: threshold, batch.
-        hulls: whether visual hulls are measured too.
-        background: what stands behind the objects.
+        hulls: whether to measure visual hulls too.
+        background: the background of the objects.
     """
     rules = {HULL: "mean", STRICT_HULL: "all"} if hulls else {}
-    scores = {name: Scores() for name in (*(contender.name for contender in contenders), *rules)}
-    resolution = shared(contenders, "resolution")
+    scores = {name: Scores() for name in (*(method.name for method in methods), *rules)}
+    resolution = shared(methods, "resolution")
     for batch in batches(
         shapes, views, options.batch, resolution=resolution, background=background, progress=options.progress
     ):
         assert batch.occupancy is not None
         assert batch.mask is not None
-        for contender in contenders:
-            found = iou_by_view(contender.occupancies(batch.images, batch.cameras), batch.occupancy, options.threshold)
-            scores[contender.name].add(batch.name, batch.category, found)
+        for method in methods:
+            found = iou_by_view(method.occupancies(batch.images, batch.cameras), batch.occupancy, options.threshold)
+            scores[method.name].add(batch.name, batch.category, found)
         for name, rule in rules.items():
             found = hull_iou(batch.mask, batch.cameras, batch.occupancy, rule=rule)
             scores[name].add(batch.name, batch.category, found)
@@ -93,13 +91,13 @@ def measure_iou(
 
 
 def table_of_views(title: str, scores: Mapping[str, Scores], views: int, papers: Mapping[str, str]) -> Table:
-    """A line for every method and, below, for what the paper says of it.
+    """A row for every method and, below, for its numbers in the paper.
 
     Args:
         title: what it shows.
         scores: of every method after 1, 2, ... views.
-        views: the columns.
-        papers: the paper's name of some methods.
+        views: the number of columns.
+        papers: the names of some methods in the paper.
     """
     rows = [Row(name, one.cells(100)) for name, one in scores.items()]
     rows += [paper_row(paper, IOU[paper], views) for paper in dict.fromkeys(papers.values())]
@@ -108,18 +106,18 @@ def table_of_views(title: str, scores: Mapping[str, Scores], views: int, papers:
     return Table("views", title, [str(view) for view in range(1, views + 1)], rows, footnote=footnote)
 
 
-def _known(contenders: Sequence[Contender]) -> dict[str, str]:
-    """The paper's name of every method that its table 1 has."""
-    titles = {contender.name: contender.title for contender in contenders}
+def _known(methods: Sequence[Method]) -> dict[str, str]:
+    """The name in the paper of every method in its table 1."""
+    titles = {method.name: method.title for method in methods}
     return {name: title for name, title in titles.items() if title in IOU} | {HULL: HULL}
 
 
-def _table_of_categories(contender: Contender, scores: Scores, categories: Sequence[str]) -> Table:
+def _table_of_categories(method: Method, scores: Scores, categories: Sequence[str]) -> Table:
     views = len(scores.values[0]) if scores.values else 0
     rows = [Row(f"views: {view}", scores.category_cells(view - 1, categories, 100)) for view in range(1, views + 1)]
     rows += [
         paper_categories(f"views: {view}", numbers, categories)
-        for view, numbers in enumerate(IOU_OF_CATEGORIES.get(contender.title, ())[:views], 1)
+        for view, numbers in enumerate(IOU_OF_CATEGORIES.get(method.title, ())[:views], 1)
     ]
-    name = contender.name
+    name = method.name
     return Table(f"categories of {name}", f"{name}, voxel IoU [%]", [*categories, "mean"], rows)

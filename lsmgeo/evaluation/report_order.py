@@ -1,4 +1,4 @@
-"""How much the order of the views matters: the same views, given in several orders."""
+"""How much the order of the views matters: the same views in several orders."""
 
 from __future__ import annotations
 
@@ -9,77 +9,75 @@ from torch import Tensor
 
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.evaluation.held_out_shapes import ORDER, Shapes, batches, generator_of
-from lsmgeo.evaluation.methods import Contender, shared
-from lsmgeo.evaluation.options import Options
+from lsmgeo.evaluation.methods import Method, Options, shared
 from lsmgeo.evaluation.plots import Curve, draw_curves
-from lsmgeo.evaluation.report import Cell, Report, Row, Table
-from lsmgeo.evaluation.scores import Scores, iou_by_view
+from lsmgeo.evaluation.report import Cell, Report, Row, Scores, Table, iou_by_view
 
 __all__ = ["report_order"]
 
 COUNTS = (2, 4, 8, 12, 16, 20)
-# Of a shape's IoU over the orders: mean, standard deviation, range; of its voxels: deviation of probabilities, and the
-# share of those that are occupied in some order that are not in another.
+# Of the IoU of a shape over the orders: mean, standard deviation, range. Of its voxels: deviation of probabilities, and
+# of those that are occupied in some order the share that is empty in another.
 MEASURES = (
     "mean IoU [%]", "deviation [points]", "range [points]", "deviation of voxels [%]", "voxels that change [%]"
 )  # fmt: skip
-# By how much the mean IoU of the whole set differs between the best and the worst of the orders.
+# The difference of the mean IoU of the whole set between the best and the worst order.
 OF_THE_SET = "range of the set [points]"
 
 
-def report_order(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
+def report_order(methods: Sequence[Method], shapes: Shapes, views: int, options: Options) -> Report:
     """Measure how results vary with the order of the views ("very little variance", Kar et al. 2017, section 3).
 
-    The first 2, 4 and 8 views of every shape are given in several random orders. Measured are, per shape, the standard
+    The first 2, 4 and 8 views of every shape are used in several random orders. The measures per shape are the standard
     deviation and the range of IoU over the orders; the deviation of each voxel's probability, averaged over the voxels
     that are occupied in any order; the share of these that are empty in another; and the range of the whole set's IoU.
 
     Args:
-        contenders: voxel models of one resolution.
-        shapes: what is evaluated on.
+        methods: voxel models of one resolution.
+        shapes: the shapes to test on.
         views: the largest number, 8 in the paper.
         options: orders (8), seed, threshold, batch.
 
     Returns:
-        A table a model, means of the categories; a picture of IoU with the deviation as bars.
+        A table per model, of means over categories; a figure of IoU with the deviation as error bars.
 
     Raises:
         OptionError: models of different resolutions.
     """
     counts = [count for count in COUNTS if count < views] + ([views] if views > 1 else [])
-    scores = {(contender.name, count): Scores() for contender in contenders for count in counts}
+    scores = {(method.name, count): Scores() for method in methods for count in counts}
     every_order = {key: Scores() for key in scores}
-    resolution = shared(contenders, "resolution")
+    resolution = shared(methods, "resolution")
     for batch in batches(shapes, views, options.batch, resolution=resolution, progress=options.progress):
         assert batch.occupancy is not None
         for count in counts:
             orders = torch.stack([_orders(options.seed, name, count, options.orders) for name in batch.name])
-            for contender in contenders:
+            for method in methods:
                 found = [
-                    contender.occupancies(*_reordered(batch.images, batch.cameras, orders[:, turn]), every=False)
-                    for turn in range(options.orders)
+                    method.occupancies(*_reordered(batch.images, batch.cameras, orders[:, number]), every=False)
+                    for number in range(options.orders)
                 ]
                 together = torch.stack(found, 1)
                 iou = iou_by_view(together, batch.occupancy, options.threshold)
-                key = (contender.name, count)
+                key = (method.name, count)
                 every_order[key].add(batch.name, batch.category, iou)
                 scores[key].add(batch.name, batch.category, _spread(together, iou, options.threshold))
     tables, curves = [], []
-    for contender in contenders:
-        cells = {count: scores[contender.name, count].cells(100) for count in counts}
-        means = {count: [cell.value for cell in every_order[contender.name, count].cells(100)] for count in counts}
+    for method in methods:
+        cells = {count: scores[method.name, count].cells(100) for count in counts}
+        means = {count: [cell.value for cell in every_order[method.name, count].cells(100)] for count in counts}
         rows = [Row(f"{count} views", [*cells[count], Cell(max(means[count]) - min(means[count]))]) for count in counts]
         tables.append(
             Table(
-                f"order of {contender.name}",
-                f"{contender.name}, {options.orders} orders",
+                f"order of {method.name}",
+                f"{method.name}, {options.orders} orders",
                 (*MEASURES, OF_THE_SET),
                 rows,
                 2,
             )
         )
         bars = [Cell(cells[count][0].value, cells[count][1].value / 2) for count in counts]  # drawn twice as long
-        curves.append(Curve(contender.name, counts, bars))
+        curves.append(Curve(method.name, counts, bars))
     return Report(
         "order",
         tables,
@@ -103,7 +101,7 @@ def report_order(contenders: Sequence[Contender], shapes: Shapes, views: int, op
 
 
 def _orders(seed: int, name: str, views: int, orders: int) -> Tensor:
-    """Random orders (orders, views) of a shape's first views; the first is as they come."""
+    """Random orders (orders, views) of the first views of a shape; the first is 0, 1, 2, ..."""
     drawn = generator_of(seed, f"{name}, {views} views", ORDER).random((orders, views)).argsort(1, kind="stable")
     found = torch.from_numpy(drawn)
     found[0] = torch.arange(views)

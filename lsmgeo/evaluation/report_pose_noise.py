@@ -1,4 +1,4 @@
-"""The figure of noisy poses: voxel IoU against the angle by which cameras are wrong."""
+"""The figure of noisy poses: voxel IoU against the largest angle of the noise."""
 
 from __future__ import annotations
 
@@ -11,45 +11,43 @@ from lsmgeo.cameras import CameraTensors, perturb, select, stack
 from lsmgeo.data import Batch
 from lsmgeo.evaluation.baselines import HULL, hull_iou
 from lsmgeo.evaluation.held_out_shapes import Shapes, batches, noise_of
-from lsmgeo.evaluation.methods import Contender, shared
-from lsmgeo.evaluation.options import Options
+from lsmgeo.evaluation.methods import Method, Options, shared
 from lsmgeo.evaluation.plots import Curve, draw_curves
-from lsmgeo.evaluation.report import Report, Row, Table
-from lsmgeo.evaluation.scores import Scores, iou_by_view, joined
+from lsmgeo.evaluation.report import Report, Row, Scores, Table, iou_by_view, joined
 
-__all__ = ["report_pose_noise", "turned"]
+__all__ = ["report_pose_noise", "with_noise"]
 
 
-def report_pose_noise(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
-    """Measure IoU with cameras turned about the object by random angles up to 0, 5, ... degrees.
+def report_pose_noise(methods: Sequence[Method], shapes: Shapes, views: int, options: Options) -> Report:
+    """Measure IoU with cameras rotated about the object by random angles up to 0, 5, ... degrees.
 
-    Every camera keeps looking at the object (`lsmgeo.cameras.perturb`), and its axis and the share of the largest angle
-    are the same at all angles, so that curves are of one draw (Kar et al. 2017, appendix A.1).
+    Every camera keeps looking at the object (`lsmgeo.cameras.perturb`). Its axis, and its angle as a share of the
+    largest, are the same for all largest angles: a curve is of one draw (Kar et al. 2017, appendix A.1).
 
     Args:
-        contenders: voxel models of one resolution, such as one trained without noise and one with.
-        shapes: what is evaluated on.
+        methods: voxel models of one resolution, such as one trained without noise and one with.
+        shapes: the shapes to test on.
         views: 4 in the paper.
         options: degrees, seed, threshold, batch.
 
     Returns:
-        Table "degrees" with the IoU after all views, and a picture of the curves.
+        Table "degrees" with the IoU after all views, and a figure of the curves.
 
     Raises:
         OptionError: models of different resolutions.
     """
     angles = tuple(sorted(set(options.degrees)))
-    resolution = shared(contenders, "resolution")
-    scores = {name: Scores() for name in (*(contender.name for contender in contenders), HULL)}
+    resolution = shared(methods, "resolution")
+    scores = {name: Scores() for name in (*(method.name for method in methods), HULL)}
     for batch in batches(shapes, views, options.batch, resolution=resolution, progress=options.progress):
         assert batch.occupancy is not None
         assert batch.mask is not None
         found: dict[str, list[Tensor]] = {name: [] for name in scores}
         for angle in angles:
-            cameras = turned(batch, angle, options.seed)
-            for contender in contenders:
-                last = contender.occupancies(batch.images, cameras, every=False)[:, None]
-                found[contender.name].append(iou_by_view(last, batch.occupancy, options.threshold))
+            cameras = with_noise(batch, angle, options.seed)
+            for method in methods:
+                last = method.occupancies(batch.images, cameras, every=False)[:, None]
+                found[method.name].append(iou_by_view(last, batch.occupancy, options.threshold))
             found[HULL].append(hull_iou(batch.mask, cameras, batch.occupancy)[:, -1:])
         for name, parts in found.items():
             scores[name].add(batch.name, batch.category, torch.cat(parts, 1))
@@ -73,8 +71,8 @@ def report_pose_noise(contenders: Sequence[Contender], shapes: Shapes, views: in
     )
 
 
-def turned(batch: Batch, degrees: float, seed: int) -> CameraTensors:
-    """The cameras of a batch, each shape's turned by noise of its own.
+def with_noise(batch: Batch, degrees: float, seed: int) -> CameraTensors:
+    """The cameras of a batch, rotated by noise that is different for each shape.
 
     Args:
         batch: the shapes.

@@ -1,4 +1,4 @@
-"""The figure of generalisation: by how much IoU drops on categories that were not trained on."""
+"""The figure of generalisation: the drop of IoU on categories that were not trained on."""
 
 from __future__ import annotations
 
@@ -7,44 +7,42 @@ from collections.abc import Mapping, Sequence
 
 from lsmgeo.errors import OptionError
 from lsmgeo.evaluation.held_out_shapes import Shapes
-from lsmgeo.evaluation.methods import Contender
-from lsmgeo.evaluation.options import Options
+from lsmgeo.evaluation.methods import Method, Options
 from lsmgeo.evaluation.plots import Curve, draw_curves
-from lsmgeo.evaluation.report import Report, Row, Table
+from lsmgeo.evaluation.report import Report, Row, Scores, Table, joined
 from lsmgeo.evaluation.report_iou import measure_iou
-from lsmgeo.evaluation.scores import Scores, joined
 
 __all__ = ["report_unseen"]
 
 
-def report_unseen(contenders: Sequence[Contender], shapes: Shapes, views: int, options: Options) -> Report:
+def report_unseen(methods: Sequence[Method], shapes: Shapes, views: int, options: Options) -> Report:
     """Measure the drop of IoU on unseen categories by the number of views.
 
     Equation: for a category C that a model has not been trained on, the IoU of the same network trained on all
-    categories less that model's, on the same shapes and views; the mean over all such categories (Kar et al. 2017,
-    section 4, "Generalization"). How a model was trained is read from its file.
+    categories minus that of the model, on the same shapes and views; the mean over all such categories (Kar et al.
+    2017, section 4, "Generalization"). How a model was trained is read from its file.
 
     Args:
-        contenders: of every network one model trained on all categories and one at least trained on some: the paper
-            has V-LSM and 3D-R2N2 w/pose, each trained on all, on the first and on the second part of the categories.
-        shapes: what is evaluated on, of all categories.
+        methods: of every network one model trained on all categories and at least one trained on some: in the paper
+            V-LSM and 3D-R2N2 w/pose, each trained on all, on the first and on the second part of the categories.
+        shapes: the shapes to test on, of all categories.
         views: 8 in the paper.
         options: threshold, batch.
 
     Returns:
-        Tables "drop" and "categories" (with all views), a picture of the curves.
+        Tables "drop" and "categories" (with all views), and a figure of the curves.
 
     Raises:
         OptionError: a model has no counterpart, or models of different resolutions.
     """
-    pairs = _pairs(contenders, set(shapes.categories))
-    scores = measure_iou(contenders, shapes, views, options, hulls=False)
-    drops = {title: _drop(scores, some, seen_by) for title, (seen_by, some) in pairs.items()}
+    pairs = _pairs(methods, set(shapes.categories))
+    scores = measure_iou(methods, shapes, views, options, hulls=False)
+    drops = {title: _drop(scores, some, complete) for title, (complete, some) in pairs.items()}
     columns = [str(view) for view in range(1, views + 1)]
     rows = [Row(title, one.cells(100)) for title, one in drops.items()]
     parts = [
-        Row(some.name, _drop(scores, [some], seen_by).cells(100))
-        for seen_by, restricted in pairs.values()
+        Row(some.name, _drop(scores, [some], complete).cells(100))
+        for complete, restricted in pairs.values()
         for some in restricted
     ]
     categories = sorted(set(shapes.categories))
@@ -76,33 +74,29 @@ def report_unseen(contenders: Sequence[Contender], shapes: Shapes, views: int, o
     )
 
 
-def _pairs(contenders: Sequence[Contender], categories: set[str]) -> dict[str, tuple[Contender, list[Contender]]]:
-    """Of every network the model that has seen all categories, and those that have not."""
+def _pairs(methods: Sequence[Method], categories: set[str]) -> dict[str, tuple[Method, list[Method]]]:
+    """For every network, the model trained on all categories, and the others."""
     found = {}
-    for title in dict.fromkeys(contender.title for contender in contenders):
-        same = [contender for contender in contenders if contender.title == title]
+    for title in dict.fromkeys(method.title for method in methods):
+        same = [method for method in methods if method.title == title]
         complete = [one for one in same if one.training.seen is None or one.training.seen >= categories]
         partial = [one for one in same if one not in complete]
         if len(complete) != 1 or not partial:
-            told = ", ".join(f"{one.name} ({one.training.words or 'on all'})" for one in same)
+            found_ones = ", ".join(f"{one.name} ({one.training.words or 'on all'})" for one in same)
             raise OptionError(
-                f"evaluate: report 'unseen' needs of every network one model trained on all categories and others "
-                f"trained on some (data.categories = 'first', 'second'); of {title} there are: {told}"
+                f"evaluate: report 'unseen' needs, for every network, one model trained on all categories and others "
+                f"trained on some (data.categories = 'first', 'second'); of {title} there are: {found_ones}"
             )
         found[title] = (complete[0], partial)
     return found
 
 
-def _drop(scores: Mapping[str, Scores], partial: Sequence[Contender], complete: Contender) -> Scores:
-    """What models lose on every shape of a category that they have not seen; NaN where all have."""
+def _drop(scores: Mapping[str, Scores], partial: Sequence[Method], complete: Method) -> Scores:
+    """The drop of IoU on every shape of a category that models were not trained on; NaN if all were."""
     reference, lost = scores[complete.name], Scores()
     lost.names, lost.categories = list(reference.names), list(reference.categories)
     for place, category in enumerate(reference.categories):
-        blind = [scores[one.name].values[place] for one in partial if category not in (one.training.seen or ())]
-        lost.values.append(
-            [
-                full - math.fsum(values) / len(values) if (values := [numbers[step] for numbers in blind]) else math.nan
-                for step, full in enumerate(reference.values[place])
-            ]
-        )
+        untrained = [scores[one.name].values[place] for one in partial if category not in (one.training.seen or ())]
+        pairs = [(full, [numbers[view] for numbers in untrained]) for view, full in enumerate(reference.values[place])]
+        lost.values.append([full - math.fsum(some) / len(some) if some else math.nan for full, some in pairs])
     return lost

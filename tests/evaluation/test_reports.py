@@ -12,8 +12,8 @@ import torch
 
 from lsmgeo.cameras import orbit, rays
 from lsmgeo.errors import OptionError
-from lsmgeo.evaluation import Contender, Options, Training, evaluate, format_table, write_report
-from lsmgeo.evaluation.baselines import Swept, sweep_views
+from lsmgeo.evaluation import Method, Options, Training, evaluate, format_table, write_report
+from lsmgeo.evaluation.baselines import DepthMaps, sweep_views
 from tests.evaluation.fakes import SIZE, FakeDepths, FakeShapes, FakeVoxels, iou
 
 # Three chairs and one lamp: a mean over shapes is not the mean of the categories.
@@ -44,7 +44,7 @@ def slabs():
 
 
 def test_iou_is_the_mean_of_the_categories_after_every_view():
-    report = evaluate([Contender("fake", FakeVoxels(by_count))], slabs(), "iou", Options(views=5))
+    report = evaluate([Method("fake", FakeVoxels(by_count))], slabs(), "iou", Options(views=5))
     expected = [mean_of([iou(views, width) for width in WIDTHS]) for views in range(1, 6)]
     np.testing.assert_allclose(values(report, "views", "fake"), expected, rtol=1e-12)
     # (0.5 + 0.5 + 1) / 3 and 2 / 8 with two views.
@@ -56,7 +56,7 @@ def test_iou_is_the_mean_of_the_categories_after_every_view():
 
 
 def test_the_threshold_and_the_paper_s_figures():
-    fake = Contender("fake", FakeVoxels(by_count))
+    fake = Method("fake", FakeVoxels(by_count))
     high = evaluate([fake], slabs(), "iou", Options(views=2, threshold=0.42))
     assert values(high, "views", "fake") == [0.0, 0.0]
     assert values(high, "views", "paper, V-LSM") == [61.5, 72.1]
@@ -65,7 +65,7 @@ def test_the_threshold_and_the_paper_s_figures():
 
 
 def test_standard_errors_are_of_the_mean_of_the_categories():
-    report = evaluate([Contender("fake", FakeVoxels(by_count))], slabs(), "iou", Options(views=2))
+    report = evaluate([Method("fake", FakeVoxels(by_count))], slabs(), "iou", Options(views=2))
     chairs = np.array([0.5, 0.5, 1.0])
     # The lamp is alone: it takes the chairs' variance.
     expected = 100 * math.sqrt(chairs.var(ddof=1) / 3 + chairs.var(ddof=1)) / 2
@@ -74,7 +74,7 @@ def test_standard_errors_are_of_the_mean_of_the_categories():
 
 def test_the_hull_of_full_silhouettes_is_all_that_is_seen():
     """Every silhouette is the whole picture, which holds the whole cube from two units away."""
-    report = evaluate([Contender("fake", FakeVoxels(by_count))], slabs(), "iou", Options(views=1))
+    report = evaluate([Method("fake", FakeVoxels(by_count))], slabs(), "iou", Options(views=1))
     for name in ("visual hull", "visual hull, strict"):
         # The object's pixel that is missing in the corner hides no more than a few voxels of 512.
         np.testing.assert_allclose(values(report, "views", name), mean_of([w / 8 for w in WIDTHS]), rtol=0.1)
@@ -97,7 +97,7 @@ class HalfSilhouettes(FakeShapes):
 def test_the_hull_after_a_view_is_of_the_views_so_far():
     """Slabs of 4 and of 2 planes, 256 and 128 of 512 voxels, against a half, a quarter and three quarters of them."""
     shapes = HalfSilhouettes((4, 2), ("chair", "lamp"))
-    report = evaluate([Contender("fake", FakeVoxels(by_count))], shapes, "iou", Options(views=5))
+    report = evaluate([Method("fake", FakeVoxels(by_count))], shapes, "iou", Options(views=5))
     scores = np.array(
         [[shape["iou"][name] for name in ("visual hull", "visual hull, strict")] for shape in report.shapes]
     )
@@ -113,7 +113,7 @@ def test_the_hull_after_a_view_is_of_the_views_so_far():
 
 @pytest.mark.parametrize("report", ["iou", "order", "pose-noise"])
 def test_the_size_of_a_batch_changes_nothing(report):
-    fake = Contender("fake", FakeVoxels(lambda images, R: 1 + int(20 * float(images[0, 0, 5, 5])) % 4))
+    fake = Method("fake", FakeVoxels(lambda images, R: 1 + int(20 * float(images[0, 0, 5, 5])) % 4))
     first, second = (
         evaluate([fake], slabs(), report, Options(views=3, batch=batch, orders=3, degrees=(0, 5))) for batch in (1, 3)
     )
@@ -125,7 +125,7 @@ def test_the_size_of_a_batch_changes_nothing(report):
 
 
 def test_backgrounds_stand_behind_the_objects():
-    fake = Contender("fake", FakeVoxels(lambda images, R: 4 if float(images[0, 0, 0, 0]) == 1 else 2))
+    fake = Method("fake", FakeVoxels(lambda images, R: 4 if float(images[0, 0, 0, 0]) == 1 else 2))
     report = evaluate([fake], slabs(), "backgrounds", Options(views=2))
     white, other = ([mean_of([iou(width, true) for true in WIDTHS])] * 2 for width in (4, 2))
     np.testing.assert_allclose(values(report, "views", "fake, white behind"), white, rtol=1e-12)
@@ -136,9 +136,9 @@ def test_unseen_categories_cost_what_the_full_model_has_more():
     # Chairs are of the first part of the categories, cars of the second.
     shapes = FakeShapes((4, 4, 4), ("chair", "chair", "car"))
     models = [
-        Contender("all", FakeVoxels(lambda images, R: 4)),
-        Contender("first", FakeVoxels(lambda images, R: 1), Training("first")),  # does not know cars
-        Contender("second", FakeVoxels(lambda images, R: 3), Training("second")),  # does not know chairs
+        Method("all", FakeVoxels(lambda images, R: 4)),
+        Method("first", FakeVoxels(lambda images, R: 1), Training("first")),  # does not know cars
+        Method("second", FakeVoxels(lambda images, R: 3), Training("second")),  # does not know chairs
     ]
     report = evaluate(models, shapes, "unseen", Options(views=2))
     np.testing.assert_allclose(values(report, "drop", "V-LSM"), [50.0, 50.0], rtol=1e-12)  # of 25 and 75 points
@@ -149,7 +149,7 @@ def test_unseen_categories_cost_what_the_full_model_has_more():
 
 def test_unseen_asks_for_a_model_trained_on_all():
     with pytest.raises(OptionError, match="of V-LSM there are: first \\(on first\\)"):
-        evaluate([Contender("first", FakeVoxels(by_count), Training("first"))], slabs(), "unseen")
+        evaluate([Method("first", FakeVoxels(by_count), Training("first"))], slabs(), "unseen")
 
 
 def test_pose_noise_turns_each_camera_by_no_more_than_its_angle_about_one_axis():
@@ -159,9 +159,7 @@ def test_pose_noise_turns_each_camera_by_no_more_than_its_angle_about_one_axis()
         turns.setdefault(len(turns), R)
         return 4
 
-    report = evaluate(
-        [Contender("fake", FakeVoxels(look))], slabs(), "pose-noise", Options(degrees=(20, 0, 10), batch=4)
-    )
+    report = evaluate([Method("fake", FakeVoxels(look))], slabs(), "pose-noise", Options(degrees=(20, 0, 10), batch=4))
     assert next(table for table in report.tables).columns == ["0°", "10°", "20°"]
     rotations = torch.stack(list(turns.values())).unflatten(0, (3, 4)).double()  # angles, shapes, views
     turned = rotations[0].transpose(-1, -2) @ rotations[1:]
@@ -180,7 +178,7 @@ def test_order_measures_the_spread_over_orders():
         return 4 if firsts[-1] < 0.075 else 2  # the first view is 0.05 bright
 
     shapes = FakeShapes((4,), ("chair",))
-    report = evaluate([Contender("fake", FakeVoxels(by_first))], shapes, "order", Options(views=2, orders=6))
+    report = evaluate([Method("fake", FakeVoxels(by_first))], shapes, "order", Options(views=2, orders=6))
     scores = [1.0 if first < 0.075 else 0.5 for first in firsts]
     assert len(scores) == 6
     assert set(scores) == {0.5, 1.0}
@@ -193,7 +191,7 @@ def test_order_measures_the_spread_over_orders():
 
 
 def test_a_model_that_minds_no_order_has_no_spread():
-    report = evaluate([Contender("fake", FakeVoxels(by_count))], slabs(), "order", Options(views=4, orders=3))
+    report = evaluate([Method("fake", FakeVoxels(by_count))], slabs(), "order", Options(views=4, orders=3))
     for row in ("2 views", "4 views"):
         assert values(report, "order of fake", row)[1:] == [0.0] * 5
 
@@ -204,14 +202,14 @@ def test_depth_counts_the_pixels_that_plane_sweep_has(monkeypatch):
     swept[:, :, half:] = 0.0
     sure = torch.zeros(3, SIZE, SIZE)
     sure[:, 4:6, :2] = 0.5
-    monkeypatch.setattr("lsmgeo.evaluation.report_depth.sweep_views", lambda *given, **options: Swept(swept, sure))
+    monkeypatch.setattr("lsmgeo.evaluation.report_depth.sweep_views", lambda *given, **options: DepthMaps(swept, sure))
     off = torch.full((SIZE, SIZE), 0.03)
     off[0] = -0.03
     off[:, half:] = 0.5  # where plane sweep has nothing
     off[:, :2] = 0.04
     off[0, 0] = -7.0  # the background
     shapes = FakeShapes((4, 2), ("chair", "lamp"))
-    report = evaluate([Contender("fake", FakeDepths(2.0 + off))], shapes, "depth", Options(views=3))
+    report = evaluate([Method("fake", FakeDepths(2.0 + off))], shapes, "depth", Options(views=3))
     np.testing.assert_allclose(values(report, "categories", "fake"), [0.03] * 3, rtol=1e-5)
     np.testing.assert_allclose(values(report, "categories", "plane sweep"), [0.05] * 3, rtol=1e-5)
     left, all_pixels = (np.abs(maps.numpy()).ravel()[1:] for maps in (off[:, :half], off))
@@ -238,21 +236,21 @@ def test_plane_sweep_finds_a_plane():
 @pytest.mark.parametrize(
     ("report", "model", "message"),
     [
-        ("iou", FakeDepths(torch.ones(SIZE, SIZE)), "report 'iou' is about voxels; fake gives depth"),
-        ("depth", FakeVoxels(by_count), "report 'depth' is about depth; fake gives voxels"),
+        ("iou", FakeDepths(torch.ones(SIZE, SIZE)), "report 'iou' measures voxels; fake predicts depth"),
+        ("depth", FakeVoxels(by_count), "report 'depth' measures depth; fake predicts voxels"),
         ("nonsense", FakeVoxels(by_count), "report must be one of 'iou'"),
     ],
 )
 def test_reports_refuse_what_they_are_not_about(report, model, message):
     with pytest.raises(OptionError, match=message):
-        evaluate([Contender("fake", model)], slabs(), report)
+        evaluate([Method("fake", model)], slabs(), report)
 
 
 def test_models_of_different_resolutions_share_no_table():
     other = FakeVoxels(by_count)
     other.resolution = 16
-    with pytest.raises(OptionError, match=re.escape("one resolution of voxels; got {'one': 8, 'two': 16}")):
-        evaluate([Contender("one", FakeVoxels(by_count)), Contender("two", other)], slabs(), "iou")
+    with pytest.raises(OptionError, match=re.escape("the same resolution of voxels; got {'one': 8, 'two': 16}")):
+        evaluate([Method("one", FakeVoxels(by_count)), Method("two", other)], slabs(), "iou")
 
 
 @pytest.mark.parametrize(
@@ -274,13 +272,13 @@ def test_options_are_checked(options, message):
 def test_fewer_views_than_wanted_are_told():
     shapes = slabs()
     shapes.most_views = 3
-    report = evaluate([Contender("fake", FakeVoxels(by_count))], shapes, "iou")
+    report = evaluate([Method("fake", FakeVoxels(by_count))], shapes, "iou")
     assert report.notes == ["the shapes have 3 views; 8 were wanted"]
     assert len(values(report, "views", "fake")) == 3
 
 
 def test_a_report_is_written_whole(tmp_path):
-    report = evaluate([Contender("fake", FakeVoxels(by_count))], slabs(), "iou", Options(views=2))
+    report = evaluate([Method("fake", FakeVoxels(by_count))], slabs(), "iou", Options(views=2))
     assert sorted(path.name for path in write_report(report, tmp_path / "new")) == ["iou.csv", "iou.json", "iou.png"]
     told = json.loads((tmp_path / "new" / "iou.json").read_text())
     assert told["facts"]["data"] == "slabs"
@@ -296,21 +294,19 @@ def test_a_report_is_written_whole(tmp_path):
 def test_the_hull_that_falls_has_a_footnote(width, falls):
     """After four views 128 voxels are left, after five 384: slabs of 64 voxels and of 256, half of them in the 128."""
     shapes = HalfSilhouettes((width,), ("chair",))
-    report = evaluate([Contender("fake", FakeVoxels(by_count))], shapes, "iou", Options(views=5))
+    report = evaluate([Method("fake", FakeVoxels(by_count))], shapes, "iou", Options(views=5))
     expected = [100 * 32 * width / (128 + 32 * width), 100 * 64 * width / 384]
     np.testing.assert_allclose(values(report, "views", "visual hull")[3:], expected, rtol=1e-12)
     assert report.tables[0].footnote.startswith("The 0.75 hull drops") == falls
     assert ("0.75 hull drops" in format_table(report.tables[0])) == falls
-    four = evaluate([Contender("fake", FakeVoxels(by_count))], shapes, "iou", Options(views=4))
+    four = evaluate([Method("fake", FakeVoxels(by_count))], shapes, "iou", Options(views=4))
     assert four.tables[0].footnote == ""
 
 
 def test_enlarged_images_are_noted():
     large = FakeVoxels(by_count)
     large.image_size = 2 * SIZE
-    report = evaluate(
-        [Contender("large", large), Contender("fake", FakeVoxels(by_count))], slabs(), "iou", Options(views=1)
-    )
+    report = evaluate([Method("large", large), Method("fake", FakeVoxels(by_count))], slabs(), "iou", Options(views=1))
     assert [note for note in report.notes if "enlarged" in note] == [
         f"images of {SIZE} pixels were enlarged to the {2 * SIZE} of large, which expects more detail"
     ]
@@ -318,6 +314,6 @@ def test_enlarged_images_are_noted():
 
 def test_a_shape_without_voxels_counts_nowhere():
     shapes = FakeShapes((4, 0), ("chair", "lamp"))
-    report = evaluate([Contender("fake", FakeVoxels(by_count))], shapes, "iou", Options(views=1))
+    report = evaluate([Method("fake", FakeVoxels(by_count))], shapes, "iou", Options(views=1))
     np.testing.assert_allclose(values(report, "views", "fake"), [100 * iou(1, 4)])
     assert math.isnan(report.shapes[1]["iou"]["fake"][0])

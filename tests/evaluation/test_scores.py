@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from lsmgeo.evaluation import Cell, Report, Row, Table, format_table, write_report
-from lsmgeo.evaluation.scores import Scores, means_of, standard_error
+from lsmgeo.evaluation.report import Scores, means_of, standard_error
 
 
 def test_the_standard_error_is_the_spread_of_repeated_draws():

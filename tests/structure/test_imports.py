@@ -133,6 +133,19 @@ def test_old_places_name_the_new_ones(name):
         old.nothing  # noqa: B018
 
 
+OLD_NAMES = [
+    ("lsmgeo.evaluation", "Contender", "Method"),
+    ("lsmgeo.evaluation", "open_contenders", "open_methods"),
+]
+
+
+@pytest.mark.parametrize(("module", "old", "new"), OLD_NAMES)
+def test_old_names_name_the_new_ones(module, old, new):
+    loaded = importlib.import_module(module)
+    with pytest.warns(DeprecationWarning, match=f"{module}.{old} is now {module}.{new}"):
+        assert getattr(loaded, old) is getattr(loaded, new)
+
+
 PACKAGES = (
     "lsmgeo.scenes",
     "lsmgeo.scenes.synthetic13",

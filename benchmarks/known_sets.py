@@ -20,7 +20,7 @@ from benchmarks.mistakes import plants
 from lsmgeo import diagnosis
 from lsmgeo.data import detect
 
-# The motorcycle comes without its calibration file; these are the published numbers at the size of its pictures.
+# The motorcycle comes without its calibration file; these are the published numbers at the size of its images.
 FOCAL_LENGTH, CX, CY, OFFSET, BASELINE = 994.978, 311.193, 254.877, 31.086, 193.001
 
 
@@ -34,7 +34,7 @@ class Figure(NamedTuple):
 
 
 def write_motorcycle(root: Path, scratch: Path) -> Path:
-    """The pair in the published form: calib.txt, two pictures, disparities as a portable float map."""
+    """The pair in the published form: calib.txt, two images, disparities as a portable float map."""
     source, folder = root / "middlebury_motorcycle", scratch / "motorcycle"
     folder.mkdir(parents=True, exist_ok=True)
     for side, name in enumerate(("left", "right")):
@@ -52,7 +52,7 @@ def write_motorcycle(root: Path, scratch: Path) -> Path:
 
 
 def copy_chessboards(root: Path, scratch: Path) -> Path:
-    """The chessboards with their list and the left lens; the M1 and D1 beside them are of other pictures."""
+    """The chessboards with their list and the left lens; the M1 and D1 beside them are of other images."""
     source, folder = root / "opencv_stereo", scratch / "chessboards"
     folder.mkdir(parents=True, exist_ok=True)
     for path in (source / "left_intrinsics.yml", source / "stereo_calib.xml", *source.glob("*[0-9].jpg")):
@@ -72,7 +72,7 @@ SETS: tuple[tuple[str, str | Callable[[Path, Path], Path], tuple[Figure, ...]], 
     ("LSM car", "lsm_sample/renders/02958343/*", LSM),
     ("LSM chair", "lsm_sample/renders/03001627/*", LSM),
     ("R2N2 chair", "r2n2/chair", (Figure(OUTLINES, "99.5", "%", True),)),
-    ("motorcycle", write_motorcycle, (Figure("picture warped by depth", "3.0", "grey levels"),)),
+    ("motorcycle", write_motorcycle, (Figure("image warped by depth", "3.0", "grey levels"),)),
     ("binvox", "binvox/*.binvox", (Figure("surface of the mesh in occupied voxels", "100.0", "%", True),)),
     ("chessboards", copy_chessboards, (Figure("rms of a stereo calibration from scratch", "0.217", "px"),)),
 )

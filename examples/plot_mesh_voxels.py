@@ -11,7 +11,7 @@ The fork lift is by TheGIWI, given to the public domain (CC0) on Blend Swap.
 """
 
 # %%
-# The mesh, its box centred and its diagonal scaled to 1, as ShapeNet has it, and three pictures of one call: colour
+# The mesh, its box centred and its diagonal scaled to 1, as ShapeNet has it, and three images of one call: colour
 # with shadows, depth, and normals.
 
 from pathlib import Path
@@ -27,7 +27,7 @@ mesh = data.normalise(data.load_mesh(folder / "truck_000.ply"))
 view = cameras.orbit(torch.tensor([38.0]), 24.0, 2.0, focal_length=740.0, height=320, width=320)
 towards = torch.nn.functional.normalize(torch.tensor([[0.5, 1.0, 0.6], [1.0, 0.1, -0.6]]), dim=-1)
 lights = scenes.Lights(towards, torch.tensor([[0.75] * 3, [0.15] * 3]), torch.full((3,), 0.3))
-picture = data.render_mesh(mesh, view, lights)
+image = data.render_mesh(mesh, view, lights)
 
 # %%
 # A tenth of its faces is taken away at random. Which voxels are solid now?
@@ -72,12 +72,10 @@ def show(axis: plt.Axes, image: torch.Tensor, title: str) -> None:
 
 
 figure, axes = plt.subplots(2, 3, figsize=(10.5, 7.2), layout="constrained")
-depth = torch.where(picture.mask[0], picture.depth[0], torch.nan)
-show(axes[0, 0], picture.images[0].permute(1, 2, 0), "the mesh")
-show(
-    axes[0, 1], depth, f"depth, {float(depth[picture.mask[0]].min()):.2f} to {float(depth[picture.mask[0]].max()):.2f}"
-)
-normals = torch.where(picture.mask[0], 0.5 + 0.5 * picture.normals[0], 1.0)
+depth = torch.where(image.mask[0], image.depth[0], torch.nan)
+show(axes[0, 0], image.images[0].permute(1, 2, 0), "the mesh")
+show(axes[0, 1], depth, f"depth, {float(depth[image.mask[0]].min()):.2f} to {float(depth[image.mask[0]].max()):.2f}")
+normals = torch.where(image.mask[0], 0.5 + 0.5 * image.normals[0], 1.0)
 show(axes[0, 2], normals.permute(1, 2, 0), "normals")
 show(axes[1, 0], data.render_mesh(holed, view, lights).images[0].permute(1, 2, 0), "a tenth of its faces missing")
 for axis, solid, title in ((axes[1, 1], whole, "voxels of the whole mesh"), (axes[1, 2], voted, "of what is left")):

@@ -1,4 +1,4 @@
-"""Drawing primitives: figures as PNG, pictures in rows, voxels shaded by NumPy alone, depth and points."""
+"""Drawing primitives: figures as PNG, images in rows, voxels shaded by NumPy alone, depth and points."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lsmgeo.errors import DTypeError, ShapeError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Picture", "as_pixels", "as_png", "draw_depth", "draw_points", "draw_voxels", "new_figure", "tile"]
+__all__ = ["Pixels", "as_pixels", "as_png", "draw_depth", "draw_points", "draw_voxels", "new_figure", "tile"]
 
 COLOUR = (0.42, 0.60, 0.84)
 # Where light comes from, in the viewer's axes (x right, y down, z forward): the left, above, and behind; of length 1.
@@ -28,13 +28,13 @@ AMBIENT = 0.4
 FINER = 2
 # Half the side of what is seen of the unit cube's world.
 REACH = 0.56
-# Dots along the side of a quad; only ones much larger than the picture would need more.
+# Dots along the side of a quad; only ones much larger than the image would need more.
 MOST_DOTS = 1 << 10
 # Between neighbouring pixels whose points are farther apart than this many of their widths there is no surface.
 STEEPEST = 10.0
 
 Floats = npt.NDArray[np.float64]
-Picture = npt.NDArray[np.uint8]
+Pixels = npt.NDArray[np.uint8]
 
 
 def new_figure(width: float, height: float, title: str = "", *, dpi: int = 100, layout: str = "constrained") -> Figure:
@@ -54,7 +54,7 @@ def as_png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def as_pixels(image: Tensor, side: int | None = None) -> Picture:
+def as_pixels(image: Tensor, side: int | None = None) -> Pixels:
     """An image (3, h, w) in [0, 1] as (h, w, 3) uint8, or as a square of that side."""
     image = image.detach().float().cpu()
     if side is not None:
@@ -62,24 +62,24 @@ def as_pixels(image: Tensor, side: int | None = None) -> Picture:
     return (image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).contiguous().numpy()
 
 
-def tile(pictures: Sequence[Sequence[Picture | None]], gap: int = 4) -> Picture:
-    """Rows of pictures of one size as one, white between them and in the place of those that are None.
+def tile(images: Sequence[Sequence[Pixels | None]], gap: int = 4) -> Pixels:
+    """Rows of images of one size as one, white between them and in the place of those that are None.
 
     Args:
-        pictures: rows, which may differ in length.
+        images: rows, which may differ in length.
         gap: pixels between two.
 
     Returns:
         (h, w, 3) uint8.
     """
-    height, width, _ = next(picture for row in pictures for picture in row if picture is not None).shape
-    columns = max(len(row) for row in pictures)
-    sheet = np.full((len(pictures) * (height + gap) - gap, columns * (width + gap) - gap, 3), 255, np.uint8)
-    for y, row in enumerate(pictures):
-        for x, picture in enumerate(row):
-            if picture is not None:
+    height, width, _ = next(image for row in images for image in row if image is not None).shape
+    columns = max(len(row) for row in images)
+    sheet = np.full((len(images) * (height + gap) - gap, columns * (width + gap) - gap, 3), 255, np.uint8)
+    for y, row in enumerate(images):
+        for x, image in enumerate(row):
+            if image is not None:
                 top, left = y * (height + gap), x * (width + gap)
-                sheet[top : top + height, left : left + width] = picture
+                sheet[top : top + height, left : left + width] = image
     return sheet
 
 
@@ -91,7 +91,7 @@ def draw_voxels(
     *,
     colour: Sequence[float] = COLOUR,
     reach: float = REACH,
-) -> Picture:
+) -> Pixels:
     """Draw the faces of occupied voxels as seen from far away.
 
     They are shaded by a light at the viewer's left, and darker where voxels stand around them.
@@ -103,7 +103,7 @@ def draw_voxels(
         occupancy: (D, H, W) bool.
         azimuth: degrees, from where it is seen.
         elevation: degrees in (-90, 90).
-        size: height and width of the picture in pixels.
+        size: height and width of the image in pixels.
         colour: of the voxels, RGB in [0, 1].
         reach: half the side of what is seen, world units.
 
@@ -139,7 +139,7 @@ def draw_depth(
     lift: float = 12.0,
     size: int = 192,
     reach: float = REACH,
-) -> Picture:
+) -> Pixels:
     """Draw a depth map as the shaded surface that it is, from a viewpoint beside its camera's.
 
     Between pixels of one surface it is filled, over jumps of depth it is torn. Shading shows errors that colours by
@@ -150,7 +150,7 @@ def draw_depth(
         camera: one camera, of any image size.
         turn: degrees by which the viewer goes round the world's origin, to the camera's right.
         lift: degrees by which they rise.
-        size: height and width of the picture in pixels.
+        size: height and width of the image in pixels.
         reach: half the side of what is seen about the world's origin, world units.
 
     Returns:
@@ -195,7 +195,7 @@ def draw_points(
     *,
     dot: float = 1.5,
     reach: float = REACH,
-) -> Picture:
+) -> Pixels:
     """Draw coloured points of the world as small squares, near ones over far ones, as seen from far away.
 
     Args:
@@ -203,7 +203,7 @@ def draw_points(
         colours: (N, 3) uint8.
         azimuth: degrees, see `draw_voxels`.
         elevation: degrees in (-90, 90).
-        size: height and width of the picture in pixels.
+        size: height and width of the image in pixels.
         dot: side of a point in pixels.
         reach: half the side of what is seen, world units.
 
@@ -247,10 +247,10 @@ def _visible_faces(grid: np.ndarray, view: Floats) -> tuple[Floats, Floats]:
     return np.concatenate(quads), np.concatenate(shades)
 
 
-def _splat(quads: Floats, colours: Floats, view: Floats, size: int, reach: float) -> Picture:
+def _splat(quads: Floats, colours: Floats, view: Floats, size: int, reach: float) -> Pixels:
     """Draw quads (Q, 4, 3) of one colour each, near over far, as seen from far away."""
     fine = check_whole("draw", "size", size, 1, 4096) * FINER
-    picture = np.ones((fine * fine, 3))
+    image = np.ones((fine * fine, 3))
     if len(quads):
         scale = fine / (2 * reach)
         dots, owner = _dots(quads, scale)
@@ -258,9 +258,9 @@ def _splat(quads: Floats, colours: Floats, view: Floats, size: int, reach: float
         column, row = (np.floor(seen[:, axis] * scale + fine / 2).astype(np.int64) for axis in (0, 1))
         inside = (column >= 0) & (column < fine) & (row >= 0) & (row < fine)
         order = np.flatnonzero(inside)[np.argsort(-seen[inside, 2], kind="stable")]
-        picture[row[order] * fine + column[order]] = colours[owner[order]]
-    picture = picture.reshape(size, FINER, size, FINER, 3).mean((1, 3))
-    return np.asarray((picture.clip(0, 1) * 255).round(), np.uint8)
+        image[row[order] * fine + column[order]] = colours[owner[order]]
+    image = image.reshape(size, FINER, size, FINER, 3).mean((1, 3))
+    return np.asarray((image.clip(0, 1) * 255).round(), np.uint8)
 
 
 def _dots(quads: Floats, scale: float) -> tuple[Floats, npt.NDArray[np.int64]]:

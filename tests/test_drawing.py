@@ -1,4 +1,4 @@
-"""Pictures of voxels, depth and points: things are where cameras see them, and what is near hides what is far."""
+"""Images of voxels, depth and points: things are where cameras see them, and what is near hides what is far."""
 
 import numpy as np
 import pytest
@@ -9,9 +9,9 @@ from lsmgeo.drawing import draw_depth, draw_points, draw_voxels, tile
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
 
 
-def covered(picture):
+def covered(image):
     """Rows and columns of the pixels that are not white."""
-    return np.argwhere((picture < 250).any(-1))
+    return np.argwhere((image < 250).any(-1))
 
 
 @pytest.mark.parametrize(("azimuth", "elevation"), [(0, 0), (40, 25), (200, -15), (300, 60)])
@@ -48,10 +48,10 @@ def test_near_voxels_hide_far_ones():
 def test_points_have_their_colours_and_near_ones_win():
     points = np.array([[0.3, 0.0, 0.0], [-0.3, 0.0, 0.0], [0.0, 0.25, 0.0]])
     colours = np.array([[255, 0, 0], [0, 0, 255], [0, 128, 0]], np.uint8)
-    picture = draw_points(points, colours, 0.0, 0.0, 100, dot=5.0, reach=0.5)
-    assert picture[50, 50].tolist() == [255, 0, 0]  # the blue one is behind
-    assert picture[25, 50].tolist() == [0, 128, 0]  # up is up
-    np.testing.assert_allclose(len(covered(picture)), 50, atol=22)
+    image = draw_points(points, colours, 0.0, 0.0, 100, dot=5.0, reach=0.5)
+    assert image[50, 50].tolist() == [255, 0, 0]  # the blue one is behind
+    assert image[25, 50].tolist() == [0, 128, 0]  # up is up
+    np.testing.assert_allclose(len(covered(image)), 50, atol=22)
 
 
 def plane(height=40, width=40):
@@ -85,9 +85,9 @@ def test_a_jump_of_depth_is_torn():
     depth, camera = plane()
     depth[10:30, 20:30] = 1.2
     whole = np.ptp(covered(draw_depth(depth, camera, turn=0.0, lift=0.0, size=100, reach=1.0))[:, 1])
-    picture = draw_depth(depth, camera, turn=-40.0, lift=0.0, size=100, reach=1.0)
-    gaps = (picture == 255).all(-1)[50]
-    inside = covered(picture)[:, 1]
+    image = draw_depth(depth, camera, turn=-40.0, lift=0.0, size=100, reach=1.0)
+    gaps = (image == 255).all(-1)[50]
+    inside = covered(image)[:, 1]
     assert gaps[inside.min() : inside.max()].any()
     assert whole > 35
 
@@ -113,7 +113,7 @@ def test_nothing_is_drawn_of_nothing():
     assert draw_points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), size=16).min() == 255
 
 
-def test_pictures_stand_in_rows():
+def test_images_stand_in_rows():
     black = np.zeros((2, 3, 3), np.uint8)
     sheet = tile([[black, None], [None, black]], gap=1)
     assert sheet.shape == (5, 7, 3)

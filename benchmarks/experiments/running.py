@@ -68,7 +68,7 @@ def run_experiment(experiment: Experiment, folder: Folder) -> int:
     """
     os.nice(19)
     torch.set_num_threads(1)
-    digest = make_set(folder)
+    digest = write_set(folder)
     path = folder.run(experiment)
     trained = training.train(experiment.config(folder.set), path)
     if trained.ended == "stop":
@@ -95,7 +95,7 @@ def run_experiment(experiment: Experiment, folder: Folder) -> int:
     return 0
 
 
-def make_set(folder: Folder) -> str:
+def write_set(folder: Folder) -> str:
     """Render the set if it is missing, compare it with that of the results, and return the hash of its values."""
     marker = folder.set / "hash.json"
     if not marker.is_file():

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lsmgeo._checks import check_finite, check_number, check_whole, describe
 from lsmgeo.classical.tsdf import Tsdf
-from lsmgeo.data.files import write_atomic
+from lsmgeo.data.atomic_files import write_atomic
 from lsmgeo.data.meshes import Mesh, check_mesh
 from lsmgeo.data.meshes.mesh_topology import components
 from lsmgeo.errors import DataError, DTypeError, GridError, OptionError, ShapeError

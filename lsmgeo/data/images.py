@@ -1,4 +1,4 @@
-"""Image files: photographs in, PNG out, and PNG of known size and kind in.
+"""Image files: images in, PNG out, and PNG of known size and kind in.
 
 OpenCV refuses what is damaged, but it guesses the kind from the content, allocates what the file announces, and
 inflates what no pixel needs. So the container is looked at first: the header must be the expected one, every chunk must
@@ -43,7 +43,7 @@ __all__ = [
 # Room for the 24 and 61 megapixels of today's cameras, below the size at which Pillow itself suspects a bomb.
 MAX_PIXELS = 1 << 26
 MAX_IMAGE_BYTES = 4096 + 8 * MAX_PIXELS
-# What the names of pictures end with, in small letters.
+# What the names of images end with, in small letters.
 SUFFIXES = (".png", ".jpg", ".jpeg")
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 LEVEL = 3
@@ -64,7 +64,7 @@ DEPTH = PngKind(16, 0, (), np.dtype(np.uint16))
 
 
 def encode_png(pixels: np.ndarray) -> bytes:
-    """Write a picture as PNG; equal pixels give equal bytes.
+    """Write an image as PNG; equal pixels give equal bytes.
 
     Args:
         pixels: (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA uint8, or (H, W) uint16.
@@ -89,7 +89,7 @@ def encode_png(pixels: np.ndarray) -> bytes:
     pixels = np.ascontiguousarray(pixels)
     if pixels.ndim == 3:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR if pixels.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
-    # Rows as differences to the row above: of all filters the smallest on flat shaded pictures and depth.
+    # Rows as differences to the row above: of all filters the smallest on flat shaded images and depth.
     options = (cv2.IMWRITE_PNG_COMPRESSION, LEVEL, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP)
     return bytes(cv2.imencode(".png", pixels, options)[1])
 
@@ -116,7 +116,7 @@ def decode_png(
 
     where = f"{member}: " if member else ""
     if content[:16] != SIGNATURE + b"\0\0\0\rIHDR" or len(content) < 33:
-        raise DataError(path, f"{where}is not a PNG picture")
+        raise DataError(path, f"{where}is not a PNG image")
     width, height, *rest = struct.unpack_from(">IIBBBBB", content, 16)
     if (height, width) != tuple(size):
         raise DataError(path, f"{where}is {width} x {height} pixels (width x height); expected {size[1]} x {size[0]}")
@@ -140,9 +140,9 @@ def decode_png(
             raise DataError(path, f"{where}holds more or less data than {width} x {height} pixels need")
         pixels = cv2.imdecode(np.frombuffer(b"".join(chunks), np.uint8), cv2.IMREAD_UNCHANGED)
     except (zlib.error, cv2.error) as error:
-        raise DataError(path, f"{where}is a damaged picture ({error})") from error
+        raise DataError(path, f"{where}is a damaged image ({error})") from error
     if pixels is None or pixels.shape != (*size, *kind.channels) or pixels.dtype != kind.dtype:
-        raise DataError(path, f"{where}is a damaged picture")
+        raise DataError(path, f"{where}is a damaged image")
     return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA) if kind.channels else pixels
 
 
@@ -167,7 +167,7 @@ def has_alpha(path: Path) -> bool:
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Read a PNG or JPEG photograph as 8-bit RGB.
+    """Read a PNG or JPEG image as 8-bit RGB.
 
     The pixels come as they are stored: an orientation that EXIF states is not applied, as COLMAP and instant-ngp do not
     apply it.
@@ -201,7 +201,7 @@ def _read(path: Path, size: tuple[int, int] | None, mode: str) -> np.ndarray:
             reason = f"is {width} x {height} pixels (width x height); its camera expects {size[1]} x {size[0]}"
             raise DataError(path, reason)
         if image.mode not in ("1", "L", "LA", "P", "RGB", "RGBA", "CMYK"):
-            raise DataError(path, f"has mode {image.mode}; expected an 8-bit picture")
+            raise DataError(path, f"has mode {image.mode}; expected an 8-bit image")
         return np.array(image.convert(mode))
 
 
@@ -216,11 +216,11 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
         if path.stat().st_size > MAX_IMAGE_BYTES:
             raise DataError(path, f"is larger than the limit of {MAX_IMAGE_BYTES} bytes")
         with warnings.catch_warnings():
-            # Pillow warns of palettes and of second pictures in a JPEG, which are read as they should be.
+            # Pillow warns of palettes and of second images in a JPEG, which are read as they should be.
             warnings.simplefilter("ignore")
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             # Sniffing among all of Pillow's formats would reach parsers (EPS, FITS) that run programs or expand files.
-            # The file itself, not its bytes: of hundreds of photographs only the headers are read when a scene opens.
+            # The file itself, not its bytes: of hundreds of images only the headers are read when a scene opens.
             with path.open("rb") as stream, Image.open(stream, formats=("PNG", "JPEG")) as image:
                 width, height = image.size
                 if width * height > MAX_PIXELS:
@@ -230,4 +230,4 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
         raise
     # Pillow's decoders raise OSError, SyntaxError, ValueError, struct.error, zlib.error and more on damaged files.
     except Exception as error:
-        raise DataError(path, f"is not a readable PNG or JPEG picture ({error})") from error
+        raise DataError(path, f"is not a readable PNG or JPEG image ({error})") from error

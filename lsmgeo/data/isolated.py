@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from lsmgeo.errors import DataError
 
-__all__ = ["isolated"]
+__all__ = ["parse_isolated"]
 
 Arrays = dict[str, np.ndarray]
 
@@ -32,7 +32,7 @@ MOST_ASKED = 1 << 26
 MOST_NAMES = 1 << 20
 
 
-def isolated(
+def parse_isolated(
     function: Callable[..., Mapping[str, np.ndarray]],
     paths: Sequence[Path],
     *arguments: object,
@@ -59,7 +59,7 @@ def isolated(
     Returns:
         For each file the arrays (bool, numbers or text), or why it cannot be used.
     """
-    from lsmgeo.data.files import read_bytes
+    from lsmgeo.data.read_files import read_bytes
     from lsmgeo.errors import DataError
 
     answers: dict[int, Arrays | DataError] = {}

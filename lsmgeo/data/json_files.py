@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lsmgeo._checks import describe
-from lsmgeo.data.files import read_text
+from lsmgeo.data.read_files import read_text
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-__all__ = ["peek_json", "read_json", "take_array", "take_number", "take_text"]
+__all__ = ["read_array", "read_json", "read_number", "read_string", "sniff_json"]
 
 MAX_JSON_BYTES = 1 << 24
 
@@ -32,7 +32,7 @@ def read_json(path: Path) -> dict[str, Any]:
     return values
 
 
-def peek_json(path: Path) -> dict[str, Any]:
+def sniff_json(path: Path) -> dict[str, Any]:
     """The JSON object of a file for telling whose it is, empty where it holds some other JSON.
 
     Raises:
@@ -51,7 +51,7 @@ def _parse(path: Path) -> Any:
         raise DataError(path, f"is not JSON that can be used ({error})") from error
 
 
-def take_number(values: Mapping[str, Any], key: str, path: Path, where: str, *, beyond: float = 1e12) -> float:
+def read_number(values: Mapping[str, Any], key: str, path: Path, where: str, *, beyond: float = 1e12) -> float:
     """The number under a key, between -``beyond`` and ``beyond``.
 
     Raises:
@@ -64,7 +64,7 @@ def take_number(values: Mapping[str, Any], key: str, path: Path, where: str, *, 
     return float(value)
 
 
-def take_text(values: dict[str, Any], key: str, path: Path, where: str) -> str:
+def read_string(values: dict[str, Any], key: str, path: Path, where: str) -> str:
     """The text under a key.
 
     Raises:
@@ -76,7 +76,7 @@ def take_text(values: dict[str, Any], key: str, path: Path, where: str) -> str:
     return value
 
 
-def take_array(values: dict[str, Any], key: str, shape: tuple[int, ...], path: Path, where: str) -> np.ndarray:
+def read_array(values: dict[str, Any], key: str, shape: tuple[int, ...], path: Path, where: str) -> np.ndarray:
     """The array of finite numbers under a key, float64, nested lists of exactly this shape.
 
     Raises:

@@ -14,7 +14,11 @@ from lsmgeo.cameras import CameraTensors, as_tensors
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import DTypeError, ShapeError
 
-__all__ = ["Batch", "Sample", "check_sample", "collate", "first_views", "pad_with_first", "pad_with_zeros"]
+__all__ = ["MAX_VIEWS", "Batch", "Sample", "check_sample", "collate", "first_views", "pad_with_first", "pad_with_zeros"]
+
+
+# Of a shape, in a set of shapes.
+MAX_VIEWS = 1000
 
 
 class Sample(NamedTuple):

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from lsmgeo.data.formats.calibration import CalibratedLens, Calibration
+    from lsmgeo.data.formats.format_opencv import CalibratedLens, Calibration
 
 __all__ = ["examine_calibration"]
 
@@ -119,7 +119,7 @@ def examine_calibration(calibration: Calibration, path: Path) -> Findings:
     """
     report = _Report([], [], [], [])
     _state(calibration, report)
-    if not any(calibration.pictures):
+    if not any(calibration.images):
         remedy = "List the pictures of the board in the file, or put them beside it in one folder, and name that."
         return _concluded(report, Gap(f"{path} names no picture of a board", remedy))
     scene = _look(calibration, report)
@@ -171,11 +171,11 @@ def _look(calibration: Calibration, report: _Report) -> _Scene:
     corners = USUAL_BOARD if board is None else board.corners
     if board is None:
         report.facts.append(("board", f"{corners[0]} x {corners[1]} corners, as in OpenCV's samples; none is stated"))
-    count = len(calibration.pictures[0])
+    count = len(calibration.images[0])
     chosen = np.unique(np.linspace(0, count - 1, min(count, MOST_PICTURES)).round().astype(int))
     if len(chosen) < count:
         report.remarks.append(f"Of {count} pictures a camera {len(chosen)} were looked at.")
-    paths = tuple(tuple(side[index] for index in chosen) for side in calibration.pictures)
+    paths = tuple(tuple(side[index] for index in chosen) for side in calibration.images)
     seen = tuple(look_at(side, corners) for side in paths)
     points = board_points(corners)
     cameras = ("first camera", "second camera") if len(seen) > 1 else ("camera",)

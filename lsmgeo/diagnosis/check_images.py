@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lsmgeo.data import PosedImages
-from lsmgeo.data.posed import Voxels
+from lsmgeo.data.posed_images import Voxels
 from lsmgeo.diagnosis.evidence import Evidence, Features, Points, gather_evidence, pair_medians
 from lsmgeo.diagnosis.feature_matching import choose_views
 from lsmgeo.diagnosis.find_cause import explain, invisible_errors, is_suspicious

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lsmgeo.data.files import plain_files
 from lsmgeo.data.formats.format_binvox import PATTERN, is_binvox, read_binvox
 from lsmgeo.data.meshes import load_mesh
+from lsmgeo.data.read_files import plain_files
 from lsmgeo.diagnosis.findings import Cause, Check, Findings, Gap
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
     from lsmgeo.data.meshes import Mesh
-    from lsmgeo.data.posed import Voxels
+    from lsmgeo.data.posed_images import Voxels
 
 __all__ = ["examine_voxels"]
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from lsmgeo.data.formats.calibration import CalibratedLens
+from lsmgeo.data.formats.format_opencv import CalibratedLens
 from lsmgeo.data.images import read_image
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from math import isnan
 from typing import NamedTuple
 
-from lsmgeo.drawing import Picture, as_png, new_figure, tile
+from lsmgeo.drawing import Pixels, as_png, new_figure, tile
 from lsmgeo.evaluation.report import Cell
 
 __all__ = ["Curve", "draw_curves", "sheet"]
@@ -73,7 +73,7 @@ def draw_curves(
 
 
 def sheet(
-    rows: Sequence[Sequence[Picture | None]],
+    rows: Sequence[Sequence[Pixels | None]],
     names: Sequence[str],
     columns: Sequence[str],
     *,

@@ -12,7 +12,7 @@ from lsmgeo.cameras import CameraTensors, select
 from lsmgeo.classical.stereo import points_of
 from lsmgeo.data import Batch
 from lsmgeo.data.sample import first_views
-from lsmgeo.drawing import Picture, as_pixels, draw_depth, draw_points
+from lsmgeo.drawing import Pixels, as_pixels, draw_depth, draw_points
 from lsmgeo.evaluation.baselines import SWEEP, sweep_views
 from lsmgeo.evaluation.held_out_shapes import Shapes, batches
 from lsmgeo.evaluation.methods import Method, Options, shared
@@ -118,9 +118,9 @@ def _draw(
     clouds: dict[tuple[str, int], tuple[np.ndarray, np.ndarray]],
 ) -> bytes:
     camera = select(select(batch.cameras, 0, 0), 0, 0)
-    rows: list[list[Picture | None]] = []
+    rows: list[list[Pixels | None]] = []
     for name in methods:
-        shaded: list[Picture | None] = [draw_depth(depths[name, count][0], camera, size=SIDE) for count in counts]
+        shaded: list[Pixels | None] = [draw_depth(depths[name, count][0], camera, size=SIDE) for count in counts]
         if name == TRUTH:
             shaded[1:] = [None] * len(shaded[1:])  # it does not depend on the number of views
         drawn = [draw_points(*clouds[name, count], size=SIDE) for count in counts]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lsmgeo.cameras import select
 from lsmgeo.data import Batch
-from lsmgeo.drawing import Picture, as_pixels, draw_depth
+from lsmgeo.drawing import Pixels, as_pixels, draw_depth
 from lsmgeo.evaluation.baselines import SURE, SWEEP, DepthMaps, sweep_views
 from lsmgeo.evaluation.held_out_shapes import Shapes, batches
 from lsmgeo.evaluation.methods import Method, Options, shared
@@ -46,7 +46,7 @@ def report_depth(methods: Sequence[Method], shapes: Shapes, views: int, options:
     """
     size = shared(methods, "size")
     scores = {name: Scores() for name in (SWEEP, *(method.name for method in methods))}
-    rows_drawn: dict[str, list[Picture | None]] = {}
+    rows_drawn: dict[str, list[Pixels | None]] = {}
     for batch in batches(shapes.at(size), views, options.batch, resolution=None, depth=True, progress=options.progress):
         assert batch.depth is not None
         assert batch.mask is not None
@@ -107,7 +107,7 @@ def _measures(predicted: Tensor, depth: Tensor, mask: Tensor, swept: DepthMaps) 
     }
 
 
-def _draw(batch: Batch, place: int, depths: Sequence[Tensor]) -> list[Picture | None]:
+def _draw(batch: Batch, place: int, depths: Sequence[Tensor]) -> list[Pixels | None]:
     """The first view of a shape, its true depth and the depths (B, V, H, W) of methods, as shaded surfaces."""
     assert batch.depth is not None
     assert batch.mask is not None

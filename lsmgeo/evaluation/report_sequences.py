@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from lsmgeo.drawing import Picture, as_pixels, draw_voxels
+from lsmgeo.drawing import Pixels, as_pixels, draw_voxels
 from lsmgeo.evaluation.held_out_shapes import Shapes, batches
 from lsmgeo.evaluation.methods import Method, Options, shared
 from lsmgeo.evaluation.plots import sheet
@@ -63,7 +63,7 @@ def report_sequences(methods: Sequence[Method], shapes: Shapes, views: int, opti
 def _draw(images: Tensor, occupied: dict[str, Tensor], truth: Tensor, shape: str) -> bytes:
     views = len(images)
     true = draw_voxels(truth, size=SIDE)
-    rows: list[list[Picture | None]] = [[*(as_pixels(image, SIDE) for image in images), true]]
+    rows: list[list[Pixels | None]] = [[*(as_pixels(image, SIDE) for image in images), true]]
     rows += [[draw_voxels(voxels, size=SIDE) for voxels in by_view] + [None] for by_view in occupied.values()]
     columns = [f"view {view}" for view in range(1, views + 1)]
     return sheet(rows, ["views", *occupied], [*columns, "truth"], title=f"{shape}: after each view")

@@ -23,7 +23,8 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from lsmgeo._checks import check_flag
-from lsmgeo.data.files import read_bytes, write_atomic
+from lsmgeo.data.atomic_files import write_atomic
+from lsmgeo.data.read_files import read_bytes
 from lsmgeo.errors import CheckpointError, DataError, LsmGeoError, OptionError
 from lsmgeo.models.blocks import Model
 from lsmgeo.models.creating import from_settings, settings_of

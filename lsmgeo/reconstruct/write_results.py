@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lsmgeo.classical.surface import write_mesh
-from lsmgeo.data.files import refusing, write_atomic, write_point_cloud
-from lsmgeo.data.formats.format_cameras_json import NAME, state_camera, state_cameras
+from lsmgeo.data.atomic_files import write_atomic
+from lsmgeo.data.formats.format_cameras_json import NAME, camera_entry, encode_cameras
+from lsmgeo.data.formats.scene_writers import write_point_cloud
 from lsmgeo.data.images import encode_png
+from lsmgeo.data.read_files import os_errors_as_data_errors
 from lsmgeo.drawing import as_pixels
 from lsmgeo.reconstruct import result_figures
 from lsmgeo.reconstruct.page import make_page
@@ -88,7 +90,7 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
         ):
             contents[f"{kind}/{name}.png"] = encode_png(pixels)
         named = {"file": f"images/{name}.png", "photograph": scene.names[one.view]}
-        entries.append(named | state_camera(one.camera) | {"depth": f"depth/{name}.png", "depth_step": step})
+        entries.append(named | camera_entry(one.camera) | {"depth": f"depth/{name}.png", "depth_step": step})
     mesh, points, colours = results.mesh, results.points, results.colours
     if not len(points) and mesh is not None and mesh.colours is not None:
         points, colours = mesh.vertices, mesh.colours
@@ -99,7 +101,7 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
     has_mesh, has_points = mesh is not None and len(mesh.faces) > 0, len(results.points) > 0
     for name, is_there in (("model.glb", has_mesh), ("model.ply", has_mesh), ("points.ply", has_points)):
         if not is_there:
-            with refusing(folder / name, "removed"):
+            with os_errors_as_data_errors(folder / name, "removed"):
                 (folder / name).unlink(missing_ok=True)
     if mesh is not None and has_mesh:
         written["mesh"] = write_mesh(folder / "model.glb", mesh)
@@ -113,7 +115,7 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
     written["depth, 16 bit"] = folder / "depth"
     written["depth in colours"] = folder / "pictures"
     # Last, so that it never names what is not there.
-    written["cameras"] = write_atomic(folder / NAME, state_cameras(entries))
+    written["cameras"] = write_atomic(folder / NAME, encode_cameras(entries))
     return written
 
 

@@ -23,7 +23,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from lsmgeo.data import Batch, EpochSampler, ShapeDataset, ShardSet, collate
 from lsmgeo.data.shards.shape_sets import ShapeSet, SyntheticSet, render_batch, synthetic_numbers
-from lsmgeo.data.shards.shape_transforms import AdaptedShapes
+from lsmgeo.data.shards.shape_transforms import TransformedShapes
 from lsmgeo.errors import OptionError
 from lsmgeo.training.config import DataConfig
 from lsmgeo.training.launch import ignore_stop
@@ -112,7 +112,7 @@ def open_shapes(
     )
     length = len(dataset) if config.limit is None else min(config.limit, len(dataset))
     noise = config.pose_noise if is_training else 0.0
-    adapted = AdaptedShapes(dataset, need.image_size, noise, seed, length)
+    adapted = TransformedShapes(dataset, need.image_size, noise, seed, length)
     if isinstance(found, SyntheticSet):
         on_device = device.type != "cpu"
         render = partial(render_batch, depth=need.depth, device=device, at_once=on_device)

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 import lsmgeo
-from lsmgeo.data.files import atomic_folder, clear_leftovers, remove_folder, write_atomic
+from lsmgeo.data.atomic_files import atomic_folder, clear_leftovers, remove_folder, write_atomic
 from lsmgeo.errors import CheckpointError, DataError, OptionError
 from lsmgeo.models.weights import (
     CHECKPOINTS,

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lsmgeo._checks import describe
-from lsmgeo.data.files import read_text
+from lsmgeo.data.read_files import read_text
 from lsmgeo.errors import DataError, OptionError
 from lsmgeo.models.settings import check_settings, nearest
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lsmgeo.cameras import CameraTensors, select
 from lsmgeo.data import Sample
-from lsmgeo.drawing import Picture, as_pixels, draw_depth, draw_voxels, tile
+from lsmgeo.drawing import Pixels, as_pixels, draw_depth, draw_voxels, tile
 
 __all__ = ["Example", "draw_examples"]
 
@@ -31,7 +31,7 @@ class Example(NamedTuple):
     predicted: Tensor
 
 
-def draw_examples(examples: Sequence[Example]) -> Picture:
+def draw_examples(examples: Sequence[Example]) -> Pixels:
     """Draw shapes below each other: above the views in their order, below what is predicted after each, and the truth.
 
     Of depth, what is predicted after all views stands below each view, and the truth below that, as maps (near is
@@ -43,13 +43,13 @@ def draw_examples(examples: Sequence[Example]) -> Picture:
     Returns:
         (h, w, 3) uint8.
     """
-    rows: list[list[Picture | None]] = []
+    rows: list[list[Pixels | None]] = []
     for example in examples:
         rows += _voxel_rows(example) if example.sample.occupancy is not None else _depth_rows(example)
     return tile(rows)
 
 
-def _voxel_rows(example: Example) -> list[list[Picture | None]]:
+def _voxel_rows(example: Example) -> list[list[Pixels | None]]:
     sample = example.sample
     assert sample.occupancy is not None
     azimuth = _azimuth(sample.cameras)
@@ -58,13 +58,13 @@ def _voxel_rows(example: Example) -> list[list[Picture | None]]:
     return [[as_pixels(image, SIZE) for image in sample.images], [*after, truth]]
 
 
-def _depth_rows(example: Example) -> list[list[Picture | None]]:
+def _depth_rows(example: Example) -> list[list[Pixels | None]]:
     sample = example.sample
     assert sample.depth is not None
     known = sample.depth > 0
     predicted = torch.where(known, example.predicted[-1].float(), 0.0)
     low, high = (float(bound) for bound in sample.depth[known].aminmax()) if known.any() else (1.0, 2.0)
-    rows: list[list[Picture | None]] = [[as_pixels(image, SIZE) for image in sample.images]]
+    rows: list[list[Pixels | None]] = [[as_pixels(image, SIZE) for image in sample.images]]
     for depth in (predicted, sample.depth):
         near = ((high - depth) / max(high - low, 1e-6)).clamp(0, 1)
         shown = torch.where(known, 0.15 + 0.85 * near, 1.0)

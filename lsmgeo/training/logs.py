@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lsmgeo.data.files import write_atomic
+from lsmgeo.data.atomic_files import write_atomic
 from lsmgeo.data.images import encode_png
 from lsmgeo.errors import DataError
 from lsmgeo.training.config import RunConfig

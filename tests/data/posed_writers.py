@@ -1,6 +1,6 @@
 """Scenes on disk in the forms of NeRF, LLFF and Strecha, by code that shares nothing with the readers.
 
-The scene is that of `tests.data.writers`; where photographs should differ in size, each is cut to one of its own.
+The scene is that of `tests.data.writers`; where images should differ in size, each is cut to one of its own.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ TRIMS = ((0, 0), (3, 5), (0, 8), (7, 0), (2, 2))
 
 
 def trimmed(scene: Scene) -> list[np.ndarray]:
-    """The photographs, each of another size."""
+    """The images, each of another size."""
     height, width = scene.size
     return [
         image[: height - rows, : width - columns] for image, (rows, columns) in zip(scene.images, TRIMS, strict=False)
     ]
 
 
-def check_scene(read: PosedImages, scene: Scene, pictures: Sequence[np.ndarray]) -> None:
-    """Cameras and photographs are those that were written."""
+def check_scene(read: PosedImages, scene: Scene, images: Sequence[np.ndarray]) -> None:
+    """Cameras and images are those that were written."""
     np.testing.assert_allclose(read.cameras.intrinsics.numpy(), scene.K, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(read.cameras.cam_from_world[:, :3, :3].numpy(), scene.R, atol=1e-12)
     np.testing.assert_allclose(read.cameras.cam_from_world[:, :3, 3].numpy(), scene.t, atol=1e-12)
-    for view, picture in enumerate(pictures):
-        assert read.size(view) == picture.shape[:2]
-        expected = torch.from_numpy(picture.copy()).permute(2, 0, 1).to(torch.float32) / 255
+    for view, image in enumerate(images):
+        assert read.size(view) == image.shape[:2]
+        expected = torch.from_numpy(image.copy()).permute(2, 0, 1).to(torch.float32) / 255
         torch.testing.assert_close(read.load(view), expected, rtol=0, atol=0)
 
 
-def save(pictures: list[np.ndarray], names: list[str], folder: Path) -> None:
-    for name, picture in zip(names, pictures, strict=True):
+def save(images: list[np.ndarray], names: list[str], folder: Path) -> None:
+    for name, image in zip(names, images, strict=True):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(picture).save(folder / name)
+        Image.fromarray(image).save(folder / name)
 
 
 def camera_to_world(scene: Scene, view: int) -> tuple[np.ndarray, np.ndarray]:
@@ -50,10 +50,10 @@ def camera_to_world(scene: Scene, view: int) -> tuple[np.ndarray, np.ndarray]:
     return np.linalg.inv(scene.R[view]), np.linalg.solve(scene.R[view], -scene.t[view])
 
 
-def transforms(scene: Scene, pictures: list[np.ndarray], names: list[str]) -> dict:
+def transforms(scene: Scene, images: list[np.ndarray], names: list[str]) -> dict:
     """Nerfstudio's form, everything stated in every frame."""
     frames = []
-    for view, (name, picture) in enumerate(zip(names, pictures, strict=True)):
+    for view, (name, image) in enumerate(zip(names, images, strict=True)):
         axes, center = camera_to_world(scene, view)
         right, down, forward = axes.T
         matrix = np.eye(4)
@@ -61,7 +61,7 @@ def transforms(scene: Scene, pictures: list[np.ndarray], names: list[str]) -> di
         K = scene.K[view]
         frames.append(
             {
-                "file_path": name, "w": picture.shape[1], "h": picture.shape[0],
+                "file_path": name, "w": image.shape[1], "h": image.shape[0],
                 "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2] + 0.5, "cy": K[1, 2] + 0.5,
                 "transform_matrix": matrix.tolist(),
             }
@@ -69,12 +69,12 @@ def transforms(scene: Scene, pictures: list[np.ndarray], names: list[str]) -> di
     return {"camera_model": "PINHOLE", "frames": frames}
 
 
-def write_transforms(scene: Scene, folder: Path, change=None, pictures=None) -> Path:
-    """The file, after ``change(values)``; photographs of different sizes unless given."""
-    pictures = trimmed(scene) if pictures is None else pictures
+def write_transforms(scene: Scene, folder: Path, change=None, images=None) -> Path:
+    """The file, after ``change(values)``; images of different sizes unless given."""
+    images = trimmed(scene) if images is None else images
     names = [f"images/{name}" for name in scene.names]
-    save(pictures, names, folder)
-    values = transforms(scene, pictures, names)
+    save(images, names, folder)
+    values = transforms(scene, images, names)
     if change is not None:
         change(values)
     (folder / "transforms.json").write_text(json.dumps(values))
@@ -92,40 +92,40 @@ def llff_rows(scene: Scene, focal: float) -> np.ndarray:
     return np.array(rows)
 
 
-def strecha_text(scene: Scene, view: int, picture: np.ndarray) -> str:
+def strecha_text(scene: Scene, view: int, image: np.ndarray) -> str:
     """``P = K [R^T | -R^T C]``."""
     axes, center = camera_to_world(scene, view)
     lines = [*scene.K[view], np.zeros(3), *axes, center]
     text = "\n".join(" ".join(repr(float(value)) for value in line) for line in lines)
-    return f"{text}\n{picture.shape[1]} {picture.shape[0]}\n"
+    return f"{text}\n{image.shape[1]} {image.shape[0]}\n"
 
 
 def write_strecha(scene: Scene, cameras: Path, images: Path, names: list[str]) -> Path:
-    pictures = trimmed(scene)
-    save(pictures, names, images)
+    cropped = trimmed(scene)
+    save(cropped, names, images)
     cameras.mkdir(parents=True, exist_ok=True)
     for view, name in enumerate(names):
-        (cameras / f"{name}.camera").write_text(strecha_text(scene, view, pictures[view]))
+        (cameras / f"{name}.camera").write_text(strecha_text(scene, view, cropped[view]))
         (cameras / f"{name}.P").write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n")
     return cameras
 
 
-def plain_cameras(scene: Scene, pictures: list[np.ndarray]) -> dict:
+def plain_cameras(scene: Scene, images: list[np.ndarray]) -> dict:
     entries = []
-    for view, (name, picture) in enumerate(zip(scene.names, pictures, strict=True)):
+    for view, (name, image) in enumerate(zip(scene.names, images, strict=True)):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = scene.R[view], scene.t[view]
         entries.append(
-            {"file": f"images/{name}", "width": picture.shape[1], "height": picture.shape[0],
+            {"file": f"images/{name}", "width": image.shape[1], "height": image.shape[0],
              "K": scene.K[view].tolist(), "cam_from_world": pose.tolist()}
         )  # fmt: skip
     return {"format": "lsmgeo cameras", "version": 1, "pixel_center": "integer", "cameras": entries}
 
 
 def write_plain_cameras(scene: Scene, folder: Path, change=None) -> Path:
-    pictures = trimmed(scene)
-    save(pictures, scene.names, folder / "images")
-    values = plain_cameras(scene, pictures)
+    images = trimmed(scene)
+    save(images, scene.names, folder / "images")
+    values = plain_cameras(scene, images)
     if change is not None:
         change(values)
     (folder / "cameras.json").write_text(json.dumps(values))
@@ -156,7 +156,7 @@ def see_fisheye(x: np.ndarray, y: np.ndarray, k: tuple[float, ...]) -> tuple[np.
     return x * ratio, y * ratio
 
 
-def photograph_sky(see, K: np.ndarray, k: tuple[float, ...], size: tuple[int, int], R: np.ndarray) -> np.ndarray:
+def render_sky(see, K: np.ndarray, k: tuple[float, ...], size: tuple[int, int], R: np.ndarray) -> np.ndarray:
     """(H, W, 3) uint8: the texture at infinity through a lens, each pixel's ray found by Newton's method."""
     v, u = np.mgrid[: size[0], : size[1]].astype(np.float64)
     target_x, target_y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]

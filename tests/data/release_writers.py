@@ -25,7 +25,7 @@ def pixel_rays(focal: float, size: int = SIZE) -> tuple[np.ndarray, np.ndarray]:
     return (u - size / 2) / focal, (v - size / 2) / focal
 
 
-def picture(distance: np.ndarray, directions: np.ndarray, origin: np.ndarray) -> np.ndarray:
+def draw_image(distance: np.ndarray, directions: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """(H, W, 4): the ball coloured by its normal, transparent elsewhere, where the colour is noise."""
     seen = np.isfinite(distance)
     points = origin + np.where(seen, distance, 0.0)[..., None] * directions
@@ -65,7 +65,7 @@ def write_lsm(root: Path, *, views: int = 12, model: str = MODEL, synset: str = 
         directions = np.stack([across, down, np.ones_like(across)], -1) @ pose[:3, :3]
         origin = -pose[:3, 3] @ pose[:3, :3]
         depth = hit_sphere(np.broadcast_to(origin, directions.shape), directions, CENTRE, RADIUS)
-        Image.fromarray(picture(depth, directions, origin)).save(folder / f"render_{view}.png")
+        Image.fromarray(draw_image(depth, directions, origin)).save(folder / f"render_{view}.png")
         steps = np.where(np.isfinite(depth), np.rint(np.minimum(depth, 10.0) / 10 * 65535), 65535)
         Image.fromarray(steps.astype(np.uint16)).save(folder / f"depth_{view}.png")
         savemat(folder / f"camera_{view}.mat", {"K": K, "extrinsic": pose, "quat": np.zeros((1, 4))})
@@ -127,7 +127,7 @@ def write_r2n2(root: Path, *, apart: bool = False, size: int = 64, model: str = 
         directions = local @ frame.T
         origin = frame @ np.array([1.75 * distance, 0.0, 0.0])
         hit = hit_sphere(np.broadcast_to(origin, directions.shape), directions, CENTRE, RADIUS)
-        Image.fromarray(picture(hit, directions, origin)).save(folder / f"{view:02d}.png")
+        Image.fromarray(draw_image(hit, directions, origin)).save(folder / f"{view:02d}.png")
         lines.append(f"{azimuth} {elevation} {roll} {distance} 25")
     (folder / "rendering_metadata.txt").write_text("\n".join(lines) + "\n")
     (folder / "renderings.txt").write_text("".join(f"{view:02d}.png\n" for view in range(len(lines))))

@@ -87,7 +87,7 @@ def test_a_folder_with_one_solid(tmp_path):
     assert bool(data.read_binvox(tmp_path).occupancy.all())
     (tmp_path / "renamed").write_bytes(path.read_bytes())
     assert data.detect(tmp_path / "renamed").name == "binvox"
-    with pytest.raises(DataError, match="no posed photographs"):
+    with pytest.raises(DataError, match="no posed images"):
         data.open(path)
     (tmp_path / "other.binvox").write_bytes(path.read_bytes())
     with pytest.raises(DataError, match="expected one"):

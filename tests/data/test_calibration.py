@@ -55,11 +55,11 @@ def write_storage(path, **values):
     storage.release()
 
 
-def write_rig(folder, ending="yml", pictures=3):
-    """Lenses, rig and a list of pictures in three files, as OpenCV's sample leaves them."""
+def write_rig(folder, ending="yml", images=3):
+    """Lenses, rig and a list of images in three files, as OpenCV's sample leaves them."""
     folder.mkdir(parents=True, exist_ok=True)
     write_storage(folder / f"intrinsics.{ending}", M1=K1, D1=D1, M2=K2, D2=D2)
-    names = [f"{side}{number:02d}.png" for number in range(pictures) for side in ("left", "right")]
+    names = [f"{side}{number:02d}.png" for number in range(images) for side in ("left", "right")]
     # A JSON file without a matrix could be anybody's.
     more = {"images": names} if ending == "json" else {}
     write_storage(folder / f"extrinsics.{ending}", R=R, T=T, R1=np.eye(3), P1=np.eye(3, 4), Q=np.eye(4), **more)
@@ -86,11 +86,11 @@ def test_the_files_of_a_rig_read_back(tmp_path, ending):
     np.testing.assert_allclose(read.rig.rotation, R, atol=1e-15)
     np.testing.assert_allclose(read.rig.translation, T[:, 0], atol=1e-15)
     assert read.board is None
-    assert [[path.name for path in side] for side in read.pictures] == [
+    assert [[path.name for path in side] for side in read.images] == [
         ["left00.png", "left01.png", "left02.png"], ["right00.png", "right01.png", "right02.png"]
     ]  # fmt: skip
     alone = data.read_calibration(folder / f"intrinsics.{ending}")
-    assert (set(alone.lenses), alone.rig, alone.pictures) == ({"first", "second"}, None, ())
+    assert (set(alone.lenses), alone.rig, alone.images) == ({"first", "second"}, None, ())
 
 
 def test_a_single_camera_reads_back_from_text(tmp_path):
@@ -131,21 +131,21 @@ def test_a_rotation_vector_is_a_rotation(tmp_path):
     np.testing.assert_allclose(data.read_calibration(tmp_path).rig.rotation, R, atol=1e-15)
 
 
-def test_pictures_that_are_not_there_are_left_out_with_their_partner(tmp_path):
+def test_images_that_are_not_there_are_left_out_with_their_partner(tmp_path):
     folder = write_rig(tmp_path)
     (folder / "right01.png").unlink()
-    pictures = data.read_calibration(folder).pictures
-    assert [[path.name for path in side] for side in pictures] == [
+    images = data.read_calibration(folder).images
+    assert [[path.name for path in side] for side in images] == [
         ["left00.png", "left02.png"], ["right00.png", "right02.png"]
     ]  # fmt: skip
     for file in folder.glob("*.png"):
         file.unlink()
-    assert data.read_calibration(folder).pictures == ()
+    assert data.read_calibration(folder).images == ()
 
 
-def test_the_pictures_of_one_camera_are_one_list(tmp_path):
+def test_the_images_of_one_camera_are_one_list(tmp_path):
     write_storage(tmp_path / "list.yml", images=[f"view{number}.jpg" for number in range(4)], K=K1)
     for number in (0, 1, 3):
         Image.new("RGB", (8, 6)).save(tmp_path / f"view{number}.jpg")
-    pictures = data.read_calibration(tmp_path / "list.yml").pictures
-    assert [[path.name for path in side] for side in pictures] == [["view0.jpg", "view1.jpg", "view3.jpg"]]
+    images = data.read_calibration(tmp_path / "list.yml").images
+    assert [[path.name for path in side] for side in images] == [["view0.jpg", "view1.jpg", "view3.jpg"]]

@@ -31,7 +31,7 @@ MODELS = {
         ("fisheye", (0.1, -0.2, 0.1, -0.05)),
     ),
 }
-# The photographs' sizes: they differ, and K is the same.
+# The images' sizes: they differ, and K is the same.
 SIZES = [(72, 96), (69, 91), (72, 88), (65, 96), (70, 94)]
 
 
@@ -41,7 +41,7 @@ def scene():
 
 
 def write(scene, folder, model, parameters, form):
-    """The scene as COLMAP writes it: a camera and a rig for each photograph, in an order of its own."""
+    """The scene as COLMAP writes it: a camera and a rig for each image, in an order of its own."""
     made = pycolmap.Reconstruction()
     seen = []
     for view in (3, 1, 0, 4, 2):
@@ -100,7 +100,7 @@ def test_every_camera_reads_back(scene, tmp_path, model, form):
             np.testing.assert_allclose(read.lenses[view].intrinsics, taken, rtol=1e-14)
         points, pixels = read.points.observations[view]
         assert len(points) == len(made.image(view + 7).points2D)
-        # What the straightened photograph shows is what a pinhole camera sees, and what COLMAP undoes.
+        # What the straightened image shows is what a pinhole camera sees, and what COLMAP undoes.
         camera = (scene.points[points] @ scene.R[view].T + scene.t[view]) @ K.T
         np.testing.assert_allclose(pixels, camera[:, :2] / camera[:, 2:], atol=1e-7)
         keypoints = np.array([point.xy for point in made.image(view + 7).points2D])
@@ -160,7 +160,7 @@ def test_cameras_that_opencv_lacks_are_refused_by_name(scene, tmp_path, model, p
         ("OPENCV", [150.0, 150, 48, 36, 1e6, -1e6, 0, 0]),
     ],
 )
-def test_distortion_that_leaves_no_picture_is_refused(scene, tmp_path, model, parameters):
+def test_distortion_that_leaves_no_image_is_refused(scene, tmp_path, model, parameters):
     write(scene, tmp_path, "PINHOLE", [151.0, 154.0, 47.2, 37.1], "txt")
     file = tmp_path / "sparse" / "0" / "cameras.txt"
     numbers = " ".join(map(str, parameters))
@@ -190,8 +190,8 @@ def test_colmap_reads_what_is_written(scene, tmp_path):
         for point in image.points2D:
             seen = camera.img_from_cam(matrix @ [*read.point3D(point.point3D_id).xyz, 1.0])
             errors.append(np.linalg.norm(seen - point.xy))
-        with Image.open(folder / "images" / name) as picture:
-            found = torch.from_numpy(np.array(picture)).permute(2, 0, 1) / 255
+        with Image.open(folder / "images" / name) as stored:
+            found = torch.from_numpy(np.array(stored)).permute(2, 0, 1) / 255
         torch.testing.assert_close(found, bent.load(view), rtol=0, atol=0)
     assert max(errors) < 1e-7
     for number, colour in enumerate(scene.colours, 1):

@@ -90,8 +90,8 @@ def test_it_is_resumed_and_the_same_from_any_number_of_workers(written, tmp_path
 
 def test_a_change_of_any_file_makes_its_shard_again(tree, tmp_path):
     data.convert_set(tree, tmp_path / "set", per_shard=2, jobs=1)
-    picture = tree / "renders" / CAR / "m0" / "render_1.png"
-    Image.fromarray(np.asarray(Image.open(picture)) // 2 * 2).save(picture)
+    image = tree / "renders" / CAR / "m0" / "render_1.png"
+    Image.fromarray(np.asarray(Image.open(image)) // 2 * 2).save(image)
     assert data.convert_set(tree, tmp_path / "set", per_shard=2, jobs=1).kept == 1
 
 

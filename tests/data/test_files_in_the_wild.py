@@ -1,4 +1,4 @@
-"""What files of other programs hold beside the essential: marks of byte order, comments in pictures, odd names."""
+"""What files of other programs hold beside the essential: marks of byte order, comments in images, odd names."""
 
 import contextlib
 import json
@@ -22,18 +22,18 @@ from tests.data.writers import make_scene, write_colmap, write_middlebury
 
 def test_a_palette_with_transparency_is_read(tmp_path):
     indices = np.arange(12, dtype=np.uint8).reshape(3, 4) % 3
-    picture = Image.frombytes("P", (4, 3), indices.tobytes())
-    picture.putpalette([10, 20, 30, 40, 50, 60, 70, 80, 90])
-    picture.save(tmp_path / "a.png", transparency=bytes([0, 128, 255]))
+    image = Image.frombytes("P", (4, 3), indices.tobytes())
+    image.putpalette([10, 20, 30, 40, 50, 60, 70, 80, 90])
+    image.save(tmp_path / "a.png", transparency=bytes([0, 128, 255]))
     colours = np.array([[10, 20, 30], [40, 50, 60], [70, 80, 90]], np.uint8)
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), colours[indices])
     expected = np.concatenate([colours[indices], np.array([[0], [128], [255]], np.uint8)[indices]], -1)
     np.testing.assert_array_equal(read_cut_out(tmp_path / "a.png"), expected)
 
 
-def test_a_photograph_with_a_damaged_second_one_is_read(tmp_path):
-    pictures = [Image.new("RGB", (16, 8), (value,) * 3) for value in (200, 10)]
-    pictures[0].save(tmp_path / "a.jpg", format="MPO", save_all=True, append_images=pictures[1:])
+def test_an_image_with_a_damaged_second_one_is_read(tmp_path):
+    images = [Image.new("RGB", (16, 8), (value,) * 3) for value in (200, 10)]
+    images[0].save(tmp_path / "a.jpg", format="MPO", save_all=True, append_images=images[1:])
     content = (tmp_path / "a.jpg").read_bytes()
     index = content.index(b"MPF\0") + 8
     (tmp_path / "a.jpg").write_bytes(content[:index] + b"\xff\xff\xff\xff" + content[index + 4 :])
@@ -43,9 +43,9 @@ def test_a_photograph_with_a_damaged_second_one_is_read(tmp_path):
 def test_an_orientation_in_exif_is_not_applied(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6
-    picture = Image.new("L", (16, 8))
-    picture.paste(255, (8, 0, 16, 8))
-    picture.save(tmp_path / "a.jpg", exif=exif)
+    image = Image.new("L", (16, 8))
+    image.paste(255, (8, 0, 16, 8))
+    image.save(tmp_path / "a.jpg", exif=exif)
     assert (read_image(tmp_path / "a.jpg")[:, :, 0] > 127).tolist() == [[False] * 8 + [True] * 8] * 8
 
 
@@ -163,7 +163,7 @@ def test_folders_that_may_not_be_looked_into_are_refused(tmp_path, monkeypatch, 
     assert str(tmp_path) in str(caught.value)
 
 
-def test_files_beside_photographs_that_macos_leaves_are_no_photographs(tmp_path):
+def test_files_beside_images_that_macos_leaves_are_ignored(tmp_path):
     scene = make_scene()
     posed_writers.save(scene.images, [f"{view}.png" for view in range(len(scene.images))], tmp_path / "images")
     (tmp_path / "images" / "._0.png").write_bytes(b"Mac OS X")
@@ -181,7 +181,7 @@ def test_files_beside_photographs_that_macos_leaves_are_no_photographs(tmp_path)
         ("sparse", "."),
     ],
 )
-def test_photographs_of_a_model_are_found_above_it(tmp_path, monkeypatch, sparse, named):
+def test_images_of_a_model_are_found_above_it(tmp_path, monkeypatch, sparse, named):
     scene = make_scene()
     write_colmap(scene, tmp_path, form="text", sparse=sparse)
     assert data.open(tmp_path / named).paths[0].parent == tmp_path / "images"
@@ -197,7 +197,7 @@ def test_a_long_name_is_not_repeated_whole(tmp_path):
     assert len(str(caught.value)) < 1000
 
 
-def test_photographs_too_long_for_opencv_are_refused_before_they_are_read():
+def test_images_too_long_for_opencv_are_refused_before_they_are_read():
     K = np.array([[33000.0, 0, 16499.5], [0, 33000, 4.5], [0, 0, 1]])
     with pytest.raises(CameraError, match="at most 32766 pixels"):
         _ = Lens("perspective", K, (-0.01, 0.0, 0.0, 0.0), 10, 33000).pinhole

@@ -162,7 +162,7 @@ def png_of(width, height, *, payload=b""):
         (b"SIMPLE  =                    T" + b" " * 2850, "not a readable"),
     ],
 )
-def test_pictures_are_checked(tmp_path, content, match):
+def test_images_are_checked(tmp_path, content, match):
     folder = write_middlebury(SCENE, tmp_path)
     (folder / "v1.png").write_bytes(content)
     scene_refused(folder, match)
@@ -177,7 +177,7 @@ def test_pictures_are_checked(tmp_path, content, match):
         (png_of(6048, 4032), "its camera expects 32 x 24"),
     ],
 )
-def test_a_picture_of_another_size_is_refused_before_it_is_decoded(tmp_path, monkeypatch, content, match):
+def test_an_image_of_another_size_is_refused_before_it_is_decoded(tmp_path, monkeypatch, content, match):
     folder = write_colmap(SCENE, tmp_path, form="binary")
     (folder / "images" / "v1.png").write_bytes(content)
     scene = data.open(folder)
@@ -190,7 +190,7 @@ def test_a_picture_of_another_size_is_refused_before_it_is_decoded(tmp_path, mon
         scene.load(scene.names.index("v1.png"))
 
 
-def test_a_sixteen_bit_picture_is_no_photograph(tmp_path):
+def test_a_sixteen_bit_image_is_refused(tmp_path):
     folder = write_middlebury(SCENE, tmp_path)
     Image.fromarray(np.zeros((24, 32), np.uint16)).save(folder / "v1.png")
     scene_refused(folder, "8-bit")

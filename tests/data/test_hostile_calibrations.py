@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from lsmgeo import data
-from lsmgeo.data.formats import calibration
-from lsmgeo.data.formats.calibration import read_storages
+from lsmgeo.data.formats import format_opencv
+from lsmgeo.data.formats.format_opencv import read_storage_files
 from lsmgeo.errors import DataError
 from tests.data.hostile import TRIALS, judged, mutated
 from tests.data.test_calibration import YAML, write_rig, write_storage
@@ -61,7 +61,7 @@ ATTACKS = [
     ("a.xml", XML.format("<l>\n../left.jpg ../right.jpg</l>"), "outside its folder"),
     ("a.xml", XML.format("<l>\n/etc/a.jpg /etc/b.jpg</l>"), "outside its folder"),
     ("a.xml", XML.format("<l>\na.jpg a.jpg</l>"), "twice"),
-    ("a.xml", XML.format("<l>\na.jpg b.jpg</l><m>\nc.jpg d.jpg</m>"), "lists pictures"),
+    ("a.xml", XML.format("<l>\na.jpg b.jpg</l><m>\nc.jpg d.jpg</m>"), "lists images"),
     ("a.xml", '<!DOCTYPE a [<!ENTITY x SYSTEM "/etc/passwd">]>\n' + XML.format("<a>&x;</a>"), "no file of OpenCV"),
     ("a.json", '{"camera_matrix": {"type_id": "opencv-matrix", "rows": 3}}', "states no camera matrix"),
     ("a.yml", HEAD + LENS + "\0", "zero byte"),
@@ -78,13 +78,13 @@ def parsed(tmp_path_factory):
         paths.append(root / str(index) / name)
         paths[-1].parent.mkdir()
         paths[-1].write_text(content)
-    return list(zip(paths, read_storages(paths), strict=True))
+    return list(zip(paths, read_storage_files(paths), strict=True))
 
 
 @pytest.mark.parametrize("index", range(len(ATTACKS)))
 def test_calibrations_are_checked(parsed, monkeypatch, index):
     path, entries = parsed[index]
-    monkeypatch.setattr(calibration, "read_storages", lambda _: [entries])
+    monkeypatch.setattr(format_opencv, "read_storage_files", lambda _: [entries])
     with pytest.raises(DataError, match=ATTACKS[index][2]) as caught:
         data.read_calibration(path)
     assert str(caught.value.path) == str(path)
@@ -127,8 +127,8 @@ def test_compressed_files_pipes_and_links_are_not_followed(tmp_path):
 
 @pytest.mark.parametrize("array", [np.array(np.nan), np.array(1e13), np.array([[np.inf]])])
 def test_the_answer_of_a_process_is_checked(tmp_path, monkeypatch, array):
-    monkeypatch.setattr(calibration, "isolated", lambda *_, **__: [{"a": array}])
-    (found,) = read_storages([tmp_path / "a.yml"])
+    monkeypatch.setattr(format_opencv, "parse_isolated", lambda *_, **__: [{"a": array}])
+    (found,) = read_storage_files([tmp_path / "a.yml"])
     assert isinstance(found, DataError)
     assert found.path == tmp_path / "a.yml"
 
@@ -148,8 +148,8 @@ def test_damaged_calibrations_give_a_data_error_or_a_calibration(tmp_path, monke
         path.write_bytes(mutated(rng, original))
     before = sorted(tmp_path.rglob("*"))
     verdicts = []
-    for path, entries in zip(paths, read_storages(paths), strict=True):
-        monkeypatch.setattr(calibration, "read_storages", lambda _, entries=entries: [entries])
+    for path, entries in zip(paths, read_storage_files(paths), strict=True):
+        monkeypatch.setattr(format_opencv, "read_storage_files", lambda _, entries=entries: [entries])
         verdicts.append(judged(lambda path=path: data.read_calibration(path)))
     assert set(verdicts) == {"read", "refused"}
     assert verdicts.count("refused") > TRIALS // 20

@@ -1,4 +1,4 @@
-"""Pictures in shards that lie: refused by what their containers say, before a decoder sees them."""
+"""Images in shards that lie: refused by what their containers say, before a decoder sees them."""
 
 import struct
 import zlib
@@ -37,12 +37,12 @@ PNGS = {
     "a palette": (png(colour=3), "has bit depth 8, colour type 3"),
     "interlaced": (png(interlace=1), "interlacing 1"),
     "little data": (png(data=zlib.compress(bytes(100))), "more or less data"),
-    "data without end": (png(data=zlib.compress(bytes(12 * 65))[:-4]), "is a damaged picture"),
+    "data without end": (png(data=zlib.compress(bytes(12 * 65))[:-4]), "is a damaged image"),
     "a bomb": (png(data=zlib.compress(bytes(1 << 26), 9)), "more or less data"),
-    "no compression": (png(data=b"\0" * 100), "is a damaged picture"),
-    "an unknown filter": (png(data=zlib.compress(b"\5" * 12 * 65)), "is a damaged picture"),
-    "a wrong check sum": (png(before=chunk(b"IDAT", b"", 1)), "is a damaged picture"),
-    "two headers": (png(before=png()[8:33]), "is a damaged picture"),
+    "no compression": (png(data=b"\0" * 100), "is a damaged image"),
+    "an unknown filter": (png(data=zlib.compress(b"\5" * 12 * 65)), "is a damaged image"),
+    "a wrong check sum": (png(before=chunk(b"IDAT", b"", 1)), "is a damaged image"),
+    "two headers": (png(before=png()[8:33]), "is a damaged image"),
     "no header": (b"\x89PNG\r\n\x1a\n" + chunk(b"IEND", b""), "is not a PNG"),
     "a short header": (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", b"12"), "is not a PNG"),
     "a chunk beyond the end": (png()[:33] + struct.pack(">I", 2**32 - 1) + b"IDAT" + bytes(16), "ends inside"),
@@ -52,7 +52,7 @@ PNGS = {
 
 
 @pytest.mark.parametrize("name", PNGS)
-def test_pictures_are_checked(folder, name):
+def test_images_are_checked(folder, name):
     content, match = PNGS[name]
     rewritten(folder, lambda members: members.update({"00000000.00.png": content}))
     refused(folder, f"00000000.00.png: .*{match}", TAR)
@@ -61,13 +61,13 @@ def test_pictures_are_checked(folder, name):
 @pytest.mark.parametrize(
     "beside", [b"", chunk(b"PLTE", bytes(3)), chunk(b"tRNS", bytes(6)), chunk(b"acTL", struct.pack(">II", 2**31, 0))]
 )
-def test_a_valid_picture_made_by_hand_is_read_whatever_stands_beside_its_pixels(folder, beside):
+def test_a_valid_image_made_by_hand_is_read_whatever_stands_beside_its_pixels(folder, beside):
     rewritten(folder, lambda members: members.update({"00000000.00.png": png(before=beside)}))
     assert not read_all(folder)[0].mask[0].any()
 
 
 @pytest.mark.parametrize("kind", [RGBA, DEPTH])
-def test_mutated_pictures_are_refused_or_read(kind):
+def test_mutated_images_are_refused_or_read(kind):
     """With check sums made to fit, so that inflating and filters are reached."""
     rng = np.random.default_rng(0)
     shape = (12, 16, 4) if kind is RGBA else (12, 16)

@@ -23,7 +23,7 @@ STRECHA = ["0000.png", "0001.png"]
 
 
 def write(form, folder):
-    """A scene of two photographs; the files whose bytes are attacked."""
+    """A scene of two images; the files whose bytes are attacked."""
     if form in ("transforms", "bent"):
         change = (lambda values: values.update(k1=-0.1)) if form == "bent" else None
         return [write_transforms(SCENE, folder, change, list(SCENE.images)) / "transforms.json"]
@@ -94,7 +94,7 @@ def test_names_lead_nowhere_else(tmp_path, form, name):
     (folder / "images/link.png").symlink_to(tmp_path / "secret.png")
     (folder / "images/zero.png").symlink_to("/dev/zero")
     (folder / "images/loop").symlink_to(folder / "images/loop")
-    (folder / "images/text.png").write_text("no picture")
+    (folder / "images/text.png").write_text("no image")
     os.mkfifo(folder / "images/pipe.png")
     values = json.loads(file.read_text())
     entry = values["frames" if form == "transforms" else "cameras"][1]
@@ -194,7 +194,7 @@ def test_arrays_that_lie_are_refused(tmp_path, monkeypatch, attack):
     assert not (tmp_path / "pwned").exists()
 
 
-def test_llff_pictures_lead_nowhere_else(tmp_path):
+def test_llff_images_lead_nowhere_else(tmp_path):
     Image.new("RGB", (32, 24)).save(tmp_path / "secret.png")
     write("llff", tmp_path / "scene")
     (tmp_path / "scene/images/v1.png").unlink()

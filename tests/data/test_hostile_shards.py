@@ -52,8 +52,8 @@ def to_version_1(index):
 SIDECARS = {
     "another format": (lambda i: i.update(format="x"), "is not the index of a shard"),
     "a newer version": (lambda i: i.update(version=3), "has version int 3"),
-    "another tar": (lambda i: i.update(tar="../set-000000.tar"), "tells of"),
-    "another size": (lambda i: i.update(bytes=2**70), "tells of"),
+    "another tar": (lambda i: i.update(tar="../set-000000.tar"), "belongs to"),
+    "another size": (lambda i: i.update(bytes=2**70), "belongs to"),
     "no size": (lambda i: i.pop("bytes"), "lacks 'bytes'"),
     "settings of any kind": (lambda i: i.update(settings=[1]), "settings must be"),
     "a long hash": (lambda i: i.update(sha256="0" * 65), "sha256 must be"),
@@ -129,7 +129,7 @@ def test_links_and_pipes(folder, tmp_path_factory, name):
     refused(folder, "no such file", name)
 
 
-def test_pictures_that_are_too_many_at_once(tmp_path, monkeypatch):
+def test_images_that_are_too_many_at_once(tmp_path, monkeypatch):
     """What a small file claims is neither read nor made; all that is asked for counts together."""
     write_set(tmp_path, shards=1, each=1, views=2)
 
@@ -240,7 +240,7 @@ JSONS = {
     "no views": (lambda v: v.update(views=0), "views must be a whole number"),
     "many views": (lambda v: v.update(views=2**40), "views must be a whole number"),
     "other views": (lambda v: v.update(views=3), "must be 3 x 3 x 3 numbers"),
-    "a view less": (lambda v: (v.update(views=1), [m.pop() for m in v["cameras"].values()]), "tells of 1 views"),
+    "a view less": (lambda v: (v.update(views=1), [m.pop() for m in v["cameras"].values()]), "states 1 views"),
     "an impossible size": (lambda v: v.update(size=[12, 10**9]), "size: a side must be a whole number"),
     "another size": (lambda v: v.update(size=[4096, 4096]), "is 16 x 12 pixels .* expected 4096 x 4096"),
     "a size of any kind": (lambda v: v.update(size="12x16"), r"size must be \[height, width\]"),

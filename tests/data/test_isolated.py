@@ -5,7 +5,7 @@ import threading
 
 import numpy as np
 
-from lsmgeo.data.isolated import isolated
+from lsmgeo.data.isolated import parse_isolated
 from lsmgeo.errors import DataError
 
 HEAD = "import os, sys\nimport numpy as np\ndef parse(content, *arguments):\n"
@@ -19,7 +19,9 @@ def run(tmp_path, body, contents=(b"",), *arguments, **limits):
         path.write_bytes(content)
     before = sorted(tmp_path.iterdir())
     parse = runpy.run_path(str(script))["parse"]
-    found = isolated(parse, paths, *arguments, **({"limit": 1 << 24, "memory": 1 << 30, "seconds": 20.0} | limits))
+    found = parse_isolated(
+        parse, paths, *arguments, **({"limit": 1 << 24, "memory": 1 << 30, "seconds": 20.0} | limits)
+    )
     assert sorted(tmp_path.iterdir()) == before
     for path, answer in zip(paths, found, strict=True):
         assert not isinstance(answer, DataError) or (answer.path == path and answer.reason.isprintable())
@@ -94,7 +96,7 @@ def test_what_cannot_be_read_or_started_is_an_error_of_the_file(tmp_path, monkey
     small, large = run(tmp_path, body, [b"", bytes(101)], limit=100)
     assert small["a"] == 0
     assert "larger than the limit of 100 bytes" in str(large)
-    (missing,) = isolated(dict, [tmp_path / "nowhere"], limit=1, memory=1, seconds=1.0)
+    (missing,) = parse_isolated(dict, [tmp_path / "nowhere"], limit=1, memory=1, seconds=1.0)
     assert "no such file" in str(missing)
     monkeypatch.setattr("sys.executable", str(tmp_path / "no-python"))
     for answer in run(tmp_path, body, [b"", b""]):

@@ -25,9 +25,9 @@ def seen(lens, rays):
 @pytest.mark.parametrize("name", LENSES)
 def test_the_pinhole_view_is_the_widest_without_an_empty_pixel(name):
     lens = LENSES[name]
-    for picture in (np.full((72, 96), 255, np.uint8), np.full((72, 96, 4), 255, np.uint8)):
-        assert int(lens.straighten(picture).min()) == 255
-    # All of its rim lies in the picture, and each side touches the picture's own.
+    for image in (np.full((72, 96), 255, np.uint8), np.full((72, 96, 4), 255, np.uint8)):
+        assert int(lens.straighten(image).min()) == 255
+    # All of its rim lies in the image, and each side touches the image's own.
     x, y = np.linspace(0, 95, 400), np.linspace(0, 71, 400)
     sides = {"left": (0 * y, y), "right": (0 * y + 95, y), "top": (x, 0 * x), "bottom": (x, 0 * x + 71)}
     for side, rim in sides.items():
@@ -65,7 +65,7 @@ def test_pixels_that_the_model_cannot_lead_back_are_nowhere():
         ("fisheye", (-5.0, 0.0, 0.0, 0.0), 0.7),
     ],
 )
-def test_a_lens_that_leaves_no_straight_picture_says_so(kind, coefficients, shrunk):
+def test_a_lens_that_leaves_no_straight_image_says_so(kind, coefficients, shrunk):
     lens = Lens(kind, K * [[shrunk], [shrunk], [1]], coefficients, 72, 96)
     with pytest.raises(CameraError, match="the distortion"):
         lens.pinhole  # noqa: B018

@@ -12,8 +12,8 @@ from tests.data.posed_writers import llff_rows, save
 FOCAL = 157.25
 
 
-def write(scene, folder, pictures="images", rows=None):
-    save(list(scene.images), scene.names, folder / pictures)
+def write(scene, folder, images="images", rows=None):
+    save(list(scene.images), scene.names, folder / images)
     np.save(folder / "poses_bounds.npy", llff_rows(scene, FOCAL) if rows is None else rows)
     return folder
 
@@ -38,7 +38,7 @@ def test_rows_read_back(scene, tmp_path, dtype, atol, order):
     assert data.open(tmp_path / "poses_bounds.npy").names == read.names
 
 
-def test_reduced_photographs_take_their_own_camera(scene, tmp_path):
+def test_reduced_images_take_their_own_camera(scene, tmp_path):
     rows = llff_rows(scene, 4 * FOCAL)
     rows[:, 4], rows[:, 9] = 4 * 48 + 3, 4 * 64 - 2  # the originals' sides are no multiple of four
     read = data.open(write(scene, tmp_path, "images_4", rows))
@@ -48,7 +48,7 @@ def test_reduced_photographs_take_their_own_camera(scene, tmp_path):
     np.testing.assert_allclose(read.cameras.intrinsics[3].numpy(), expected, rtol=1e-14)
 
 
-def test_photographs_may_differ_in_size(scene, tmp_path):
+def test_images_may_differ_in_size(scene, tmp_path):
     write(scene, tmp_path)
     Image.fromarray(np.repeat(np.repeat(scene.images[1], 2, 0), 2, 1)).save(tmp_path / "images" / scene.names[1])
     read = data.open(tmp_path)
@@ -79,7 +79,7 @@ def mirrored(scene):
 @pytest.mark.parametrize(
     ("rows", "match"),
     [
-        (lambda s: llff_rows(s, FOCAL)[:4], "has 4 rows, and 5 pictures are in 'images'"),
+        (lambda s: llff_rows(s, FOCAL)[:4], "has 4 rows, and 5 images are in 'images'"),
         (lambda s: llff_rows(s, FOCAL)[:, :15], r"rows of 17 numbers; got an array of \(5, 15\)"),
         (lambda s: llff_rows(s, FOCAL)[0], r"rows of 17 numbers; got an array of \(17,\)"),
         (lambda s: llff_rows(s, FOCAL)[:0], "rows of 17 numbers"),
@@ -97,7 +97,7 @@ def test_rows_that_make_no_sense_are_refused(scene, tmp_path, rows, match):
         data.open(write(scene, tmp_path, rows=rows(scene)))
 
 
-def test_a_folder_without_photographs_is_refused(scene, tmp_path):
+def test_a_folder_without_images_is_refused(scene, tmp_path):
     np.save(tmp_path / "poses_bounds.npy", llff_rows(scene, FOCAL))
-    with pytest.raises(DataError, match="has 5 rows, and no folder images holds a picture"):
+    with pytest.raises(DataError, match="has 5 rows, and no folder images holds an image"):
         data.open(tmp_path)

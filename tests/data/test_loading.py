@@ -90,7 +90,7 @@ def test_workers_change_nothing(folder, workers):
     expected, came = [], []
     for batches, number in ((expected, 0), (came, workers)):
         sampler = EpochSampler(SHAPES, seed=7)
-        dataset = dataset_of(folder, background=folder_of_pictures(folder))
+        dataset = dataset_of(folder, background=folder_of_images(folder))
         loader = DataLoader(
             dataset, 4, sampler=sampler, collate_fn=collate, num_workers=number, persistent_workers=number > 0
         )
@@ -102,14 +102,14 @@ def test_workers_change_nothing(folder, workers):
     assert different(expected[0].images, expected[3].images)
 
 
-def folder_of_pictures(folder):
+def folder_of_images(folder):
     from PIL import Image
 
-    pictures = folder / "pictures"
-    pictures.mkdir(exist_ok=True)
+    images = folder / "images"
+    images.mkdir(exist_ok=True)
     noise = np.random.default_rng(0).integers(0, 256, (40, 40, 3), np.uint8)
-    Image.fromarray(noise).save(pictures / "noise.png")
-    return pictures
+    Image.fromarray(noise).save(images / "noise.png")
+    return images
 
 
 def test_orders_are_permutations():
@@ -232,7 +232,7 @@ def test_what_is_no_data_set(folder, options, error, match):
 
 @pytest.fixture
 def damaged(tmp_path):
-    """A set of 12 shapes, shape 5 damaged in all its pictures."""
+    """A set of 12 shapes, shape 5 damaged in all its images."""
     write_set(tmp_path, shards=3, each=4, views=VIEWS)
     shards = ShardSet(tmp_path)
     path = shards.path(5)
@@ -296,18 +296,18 @@ def test_too_many_bad_shapes_stop_the_run(damaged, tmp_path):
 
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_bad_background_is_no_bad_shape(damaged, workers):
-    pictures = folder_of_pictures(damaged)
-    dataset = dataset_of(damaged, on_error="skip", max_bad_fraction=1, background=pictures)
-    (pictures / "noise.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    images = folder_of_images(damaged)
+    dataset = dataset_of(damaged, on_error="skip", max_bad_fraction=1, background=images)
+    (images / "noise.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     for index in (4, 5):  # a good shape, and one that another stands in for
         loader = DataLoader(dataset, sampler=[(0, index)], collate_fn=collate, num_workers=workers)
-        with pytest.raises((DataError, RuntimeError), match=r"pictures/noise\.png: "):
+        with pytest.raises((DataError, RuntimeError), match=r"images/noise\.png: "):
             list(loader)
     report = damaged / "bad_samples.jsonl"
     assert {json.loads(line)["name"] for line in report.read_text().splitlines()} == {"shape-5"}
     with pytest.raises(DataError) as caught:
         dataset[0, 4]
-    assert caught.value.path == (pictures / "noise.png").resolve()
+    assert caught.value.path == (images / "noise.png").resolve()
 
 
 @pytest.mark.parametrize("item", [(0, 1, 2), (), (1,), [0, 1, 2], "a", (0, "a"), (0.5, 1), None])

@@ -12,7 +12,7 @@ from scipy.io import savemat
 
 from lsmgeo import data
 from lsmgeo.data.formats import format_lsm
-from lsmgeo.data.formats.format_lsm import read_mats
+from lsmgeo.data.formats.format_lsm import read_mat_files
 from lsmgeo.errors import DataError, OptionError
 from tests.data.hostile import mutated
 from tests.data.release_writers import CENTRE, MODEL, RADIUS, SYNSET, ball_voxels, lsm_pose, write_lsm
@@ -72,7 +72,7 @@ def test_depth_lies_on_the_ball(scene):
         np.testing.assert_allclose(distances.numpy(), RADIUS, atol=1e-4)
 
 
-def test_pictures_lie_before_white(scene):
+def test_images_lie_before_white(scene):
     image, mask = scene.load(0), scene.load_mask(0)
     assert bool((image[:, ~mask] == 1).all())
     assert not bool((image[:, mask] == 1).any())
@@ -195,7 +195,7 @@ def test_hostile_matlab_files_are_refused_each_for_itself(tmp_path):
     for path, (content, _) in zip(paths, cases, strict=True):
         path.write_bytes(content)
     survived = []
-    for path, (_, match), found in zip(paths, cases, read_mats(paths), strict=True):
+    for path, (_, match), found in zip(paths, cases, read_mat_files(paths), strict=True):
         if match is None:
             np.testing.assert_array_equal(found["extrinsic"], lsm_pose(0))
         elif isinstance(found, DataError):
@@ -223,7 +223,7 @@ def test_hostile_volumes_are_refused(folder, number):
     refused(folder, match, f"{MODEL}.mat")
 
 
-def test_links_and_other_pictures_are_refused(folder, tmp_path):
+def test_links_and_other_images_are_refused(folder, tmp_path):
     outside = tmp_path / "outside.mat"
     outside.write_bytes(mat(camera()))
     (folder / "camera_3.mat").unlink()
@@ -234,7 +234,7 @@ def test_links_and_other_pictures_are_refused(folder, tmp_path):
     (folder / "depth_3.png").write_bytes((folder / "render_3.png").read_bytes())
     refused(folder, "bit depth", "depth_3.png")
     (folder / "depth_3.png").unlink()
-    (folder / "render_3.png").write_text("no picture")
+    (folder / "render_3.png").write_text("no image")
     refused(folder, "not a readable", "render_3.png")
 
 
@@ -248,7 +248,7 @@ def test_damaged_matlab_files_are_refused_or_read(tmp_path):
         # Behind the free text of the header.
         content = originals[number % 2]
         paths[-1].write_bytes(content[:116] + mutated(rng, content[116:]))
-    outcomes = read_mats(paths)
+    outcomes = read_mat_files(paths)
     assert len(outcomes) == count
     refusals = [found for found in outcomes if isinstance(found, DataError)]
     assert count // 20 < len(refusals) < count
@@ -263,7 +263,7 @@ def test_damaged_matlab_files_are_refused_or_read(tmp_path):
 
 @pytest.mark.parametrize("array", [np.array([np.nan]), np.array(["text"]), np.array([7], np.uint8)])
 def test_the_answer_of_a_process_is_checked(tmp_path, monkeypatch, array):
-    monkeypatch.setattr(format_lsm, "isolated", lambda *_, **__: [{"K": array}])
-    (found,) = read_mats([tmp_path / "camera.mat"])
+    monkeypatch.setattr(format_lsm, "parse_isolated", lambda *_, **__: [{"K": array}])
+    (found,) = read_mat_files([tmp_path / "camera.mat"])
     assert isinstance(found, DataError)
     assert found.path == tmp_path / "camera.mat"

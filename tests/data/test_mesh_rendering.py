@@ -1,4 +1,4 @@
-"""Pictures of meshes against exact rays, a second way of casting them, and shadows that are known."""
+"""Images of meshes against exact rays, a second way of casting them, and shadows that are known."""
 
 import sys
 
@@ -47,7 +47,7 @@ def test_a_plane_is_exact():
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
     assert abs(normal @ (corners[3] - corners[0])) < 1e-12
     many = views()
-    picture = render_mesh(plane, many, sun((0, 1, 0)))
+    image = render_mesh(plane, many, sun((0, 1, 0)))
     for index in range(3):
         center, directions = rays(view_of(many, index))
         expected = (normal @ (corners[0] - center)) / (directions @ normal)
@@ -55,22 +55,22 @@ def test_a_plane_is_exact():
         inside = (expected > 0) & (np.abs(points[..., [0, 2]]) < 4.999).all(-1)
         outside = (expected < 0) | (np.abs(points[..., [0, 2]]) > 5.001).any(-1)
         assert inside.sum() > 300
-        assert picture.mask[index].numpy()[inside].all()
-        assert not picture.mask[index].numpy()[outside].any()
-        error = np.abs(picture.depth[index].numpy() - expected)[inside]
+        assert image.mask[index].numpy()[inside].all()
+        assert not image.mask[index].numpy()[outside].any()
+        error = np.abs(image.depth[index].numpy() - expected)[inside]
         assert (error <= length_error(F32, expected[inside] + 2)).all()
         unit = normal / np.linalg.norm(normal) * np.sign(normal @ (center - corners[0]))
         np.testing.assert_allclose(
-            picture.normals[index].numpy()[:, inside].T, np.broadcast_to(unit, (inside.sum(), 3)), atol=1e-6
+            image.normals[index].numpy()[:, inside].T, np.broadcast_to(unit, (inside.sum(), 3)), atol=1e-6
         )
-        assert not picture.depth[index].numpy()[outside].any()
-        assert not picture.normals[index].numpy()[:, outside].any()
+        assert not image.depth[index].numpy()[outside].any()
+        assert not image.normals[index].numpy()[:, outside].any()
 
 
 def test_a_sphere_is_seen_where_it_is():
     radius, many = 0.4, views()
     ball = from_trimesh(trimesh.creation.icosphere(subdivisions=5, radius=radius))
-    picture = render_mesh(ball, many, sun((0, 1, 0)))
+    image = render_mesh(ball, many, sun((0, 1, 0)))
     sag = radius * (1 - np.cos(np.deg2rad(1.2)))  # of a chord between neighbouring vertices
     for index in range(3):
         center, directions = rays(view_of(many, index))
@@ -78,13 +78,13 @@ def test_a_sphere_is_seen_where_it_is():
         root = b**2 - a * (center @ center - radius**2)
         hit = root > 0
         expected = (-b - np.sqrt(np.maximum(root, 0))) / a
-        assert abs(int(picture.mask[index].sum()) - int(hit.sum())) <= 4
-        both = hit & picture.mask[index].numpy() & (root > 0.01)  # away from the rim, where depth is steep
+        assert abs(int(image.mask[index].sum()) - int(hit.sum())) <= 4
+        both = hit & image.mask[index].numpy() & (root > 0.01)  # away from the rim, where depth is steep
         assert both.sum() > 500
-        assert (picture.depth[index].numpy() - expected)[both].max() < 12 * sag
-        assert (picture.depth[index].numpy() - expected)[both].min() > -1e-6
+        assert (image.depth[index].numpy() - expected)[both].max() < 12 * sag
+        assert (image.depth[index].numpy() - expected)[both].min() > -1e-6
         normals = (center + expected[..., None] * directions)[both] / radius
-        np.testing.assert_allclose(picture.normals[index].numpy()[:, both].T, normals, atol=3e-3)
+        np.testing.assert_allclose(image.normals[index].numpy()[:, both].T, normals, atol=3e-3)
 
 
 def test_depth_reaches_the_same_points_whatever_the_unit_and_place():
@@ -96,11 +96,11 @@ def test_depth_reaches_the_same_points_whatever_the_unit_and_place():
     moved = Mesh(np.asarray(box.vertices) * 1e-2 + far, np.asarray(box.faces))
     E = many.cam_from_world.clone()
     E[:, :3, 3] = E[:, :3, 3] * 1e-2 - (E[:, :3, :3] @ torch.from_numpy(far)[:, None])[..., 0]
-    picture = render_mesh(moved, many._replace(cam_from_world=E), sun((0, 1, 0)))
-    both = picture.mask & reference.mask
-    assert int((picture.mask ^ reference.mask).sum()) <= 2
+    image = render_mesh(moved, many._replace(cam_from_world=E), sun((0, 1, 0)))
+    both = image.mask & reference.mask
+    assert int((image.mask ^ reference.mask).sum()) <= 2
     # What is left is the rounding of the translation itself, in float64.
-    torch.testing.assert_close(picture.depth[both] * 100, reference.depth[both], atol=1e-5, rtol=0)
+    torch.testing.assert_close(image.depth[both] * 100, reference.depth[both], atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("distance", [1e3, 1e5, 1e7])
@@ -133,7 +133,7 @@ def test_the_casters_agree_on_far_rays():
     hit = expected.face >= 0
     assert 200 < hit.sum() < 800
     assert ((hits.face >= 0) == hit).mean() > 0.995
-    assert (fast.blocked(origins, directions) == hit).mean() > 0.995
+    assert (fast.occluded(origins, directions) == hit).mean() > 0.995
     same = hit & (hits.face == expected.face)
     assert same.sum() > 0.98 * hit.sum()
     # What is lost is the rounding of the origins themselves.
@@ -152,18 +152,18 @@ def test_shadows_fall_where_they_must():
         ((0.3, 1, -0.2), 0.3 * np.array([-0.3, 0.2]), near, 1e-4),
         ((0, 1, 0), np.zeros(2), far, 1e-2),
     ):
-        picture = render_mesh(mesh, camera, sun(light))
+        image = render_mesh(mesh, camera, sun(light))
         plain = render_mesh(mesh, camera, sun(light), shadows=False)
         center, directions = rays(view_of(cameras.to(camera, F64), 0))
         on_floor = center + (-0.2 - center[1]) / directions[..., 1:2] * directions
         # Only pixels whose ray meets the floor first, and not within a hair of an edge.
-        seen = np.abs(picture.depth[0].numpy() - (-0.2 - center[1]) / directions[..., 1]) < rounding
+        seen = np.abs(image.depth[0].numpy() - (-0.2 - center[1]) / directions[..., 1]) < rounding
         away = np.abs(on_floor[..., [0, 2]] - (np.array([0.05, -0.1]) + shift)).max(-1) - 0.2
         shadow, lit = seen & (away < -0.003), seen & (away > 0.003)
         assert shadow.sum() > 100
         assert lit.sum() > 500
         cosine = 1 / np.linalg.norm(light)
-        grey = picture.images[0].numpy()
+        grey = image.images[0].numpy()
         np.testing.assert_allclose(grey[:, shadow], 0.7 * 0.2, rtol=1e-5)
         np.testing.assert_allclose(grey[:, lit], 0.7 * (0.2 + 0.6 * cosine), rtol=1e-5)
         torch.testing.assert_close(
@@ -183,20 +183,20 @@ def test_shading_is_that_of_the_scenes():
     box = trimesh.creation.box((0.5, 0.4, 0.3))
     box.visual.face_colors = np.repeat(np.array([[200, 100, 50], [30, 60, 90]]), 6, 0)
     lights = sun((0.4, 1, 0.2), (1, 0, 0))
-    picture = render_mesh(from_trimesh(box), views(), lights, shadows=False, background=(0.1, 0.2, 0.3))
+    image = render_mesh(from_trimesh(box), views(), lights, shadows=False, background=(0.1, 0.2, 0.3))
     for index in range(3):
         center, directions = rays(view_of(views(), index))
-        points = center + picture.depth[index].numpy()[..., None] * directions
-        seen = picture.mask[index].numpy()
+        points = center + image.depth[index].numpy()[..., None] * directions
+        seen = image.mask[index].numpy()
         _, _, face = trimesh.proximity.closest_point_naive(box, points[seen])
         # On an edge the nearest face is a matter of rounding; its normal tells whether it is the face rendered.
-        same = (box.face_normals[face] * picture.normals[index].numpy()[:, seen].T).sum(1) > 0.999
+        same = (box.face_normals[face] * image.normals[index].numpy()[:, seen].T).sum(1) > 0.999
         assert same.mean() > 0.95
         albedo = torch.from_numpy(box.visual.face_colors[face][:, :3].astype(np.float32) / 255)
         expected = scenes.shade(albedo, torch.from_numpy(box.face_normals[face].astype(np.float32)), lights)
-        torch.testing.assert_close(picture.images[index][:, seen].T[same], expected[same], atol=1e-5, rtol=0)
+        torch.testing.assert_close(image.images[index][:, seen].T[same], expected[same], atol=1e-5, rtol=0)
         np.testing.assert_allclose(
-            picture.images[index].numpy()[:, ~seen], np.tile(np.float32([[0.1], [0.2], [0.3]]), (~seen).sum())
+            image.images[index].numpy()[:, ~seen], np.tile(np.float32([[0.1], [0.2], [0.3]]), (~seen).sum())
         )
 
 
@@ -255,7 +255,7 @@ def test_the_numpy_caster_finds_what_trying_every_triangle_finds():
         np.testing.assert_allclose(found.weights[hit], np.stack((v, w), -1)[hit, expected[hit]], atol=1e-9)
         fast = EmbreeCaster(corners.reshape(-1, 3), np.arange(3 * faces).reshape(-1, 3))
         assert (fast.first_hits(origins, directions).face == expected).mean() > 0.99
-        assert (fast.blocked(origins, directions) == hit).mean() > 0.99
+        assert (fast.occluded(origins, directions) == hit).mean() > 0.99
 
 
 def test_without_embree_numpy_takes_over(monkeypatch):
@@ -281,14 +281,14 @@ def test_the_window_of_the_mesh_loses_nothing():
     box = from_trimesh(trimesh.creation.box((0.5, 0.4, 0.3)))
     many = views(3, 40)
     whole = render_mesh(box, many, sun((0, 1, 0)))
-    # A speck behind the camera makes the window the whole picture.
+    # A speck behind the camera makes the window the whole image.
     speck = np.array([[0, 50, 0], [0, 50, 0.001], [0.001, 50, 0]]) + np.array([-80, 0, -80])
     specks = np.concatenate([speck * [x, 1, z] for x in (-1, 1) for z in (-1, 1)])
     more = Mesh(np.concatenate((box.vertices, specks)), np.concatenate((box.faces, np.arange(8, 20).reshape(-1, 3))))
-    picture = render_mesh(more, many, sun((0, 1, 0)), shadows=False)
-    torch.testing.assert_close(picture.mask, whole.mask)
-    torch.testing.assert_close(picture.depth, whole.depth, rtol=1e-5, atol=0)
-    # Partly outside the picture, wholly outside, and around the camera.
+    image = render_mesh(more, many, sun((0, 1, 0)), shadows=False)
+    torch.testing.assert_close(image.mask, whole.mask)
+    torch.testing.assert_close(image.depth, whole.depth, rtol=1e-5, atol=0)
+    # Partly outside the image, wholly outside, and around the camera.
     close = cameras.orbit(torch.tensor([0.0]), 0.0, 0.5, focal_length=40.0, height=24, width=24)
     assert bool(render_mesh(box, close, sun((0, 1, 0))).mask.all())
     shift = torch.eye(4)[None].clone()
@@ -296,19 +296,19 @@ def test_the_window_of_the_mesh_loses_nothing():
     aside = close._replace(cam_from_world=shift @ close.cam_from_world)
     assert not render_mesh(box, aside, sun((0, 1, 0))).mask.any()
     within = cameras.orbit(torch.tensor([0.0]), 0.0, 0.1, focal_length=40.0, height=24, width=24)
-    picture = render_mesh(box, within, sun((0, 1, 0)))
-    assert bool(picture.mask.all())
-    torch.testing.assert_close(picture.depth[0, 12, 12], torch.tensor(0.35), rtol=1e-5, atol=0)
+    image = render_mesh(box, within, sun((0, 1, 0)))
+    assert bool(image.mask.all())
+    torch.testing.assert_close(image.depth[0, 12, 12], torch.tensor(0.35), rtol=1e-5, atol=0)
 
 
 def test_sizes_views_and_bits():
     mesh = from_trimesh(trimesh.creation.torus(0.3, 0.1))
     many = views(2, 64)
-    picture = render_mesh(mesh, many, sun((0, 1, 0)), size=(20, 30))
-    assert picture.images.shape == picture.normals.shape == (2, 3, 20, 30)
-    assert picture.depth.shape == picture.mask.shape == (2, 20, 30)
+    image = render_mesh(mesh, many, sun((0, 1, 0)), size=(20, 30))
+    assert image.images.shape == image.normals.shape == (2, 3, 20, 30)
+    assert image.depth.shape == image.mask.shape == (2, 20, 30)
     resized = render_mesh(mesh, cameras.resize(many, 20, 30), sun((0, 1, 0)))
-    for one, other in zip(picture, resized, strict=True):
+    for one, other in zip(image, resized, strict=True):
         assert one.dtype == other.dtype
         assert torch.equal(one, other)
     none = render_mesh(
@@ -316,8 +316,8 @@ def test_sizes_views_and_bits():
     )
     assert none.images.shape == (0, 3, 4, 4)
     behind = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
-    picture = render_mesh(mesh, many, sun((0, 1, 0)), background=behind)
-    assert torch.equal(picture.images.movedim(1, -1)[~picture.mask], behind.movedim(1, -1)[~picture.mask])
+    image = render_mesh(mesh, many, sun((0, 1, 0)), background=behind)
+    assert torch.equal(image.images.movedim(1, -1)[~image.mask], behind.movedim(1, -1)[~image.mask])
 
 
 def test_what_requires_gradients_is_rendered_all_the_same():
@@ -328,8 +328,8 @@ def test_what_requires_gradients_is_rendered_all_the_same():
         intrinsics=many.intrinsics.clone().requires_grad_(), cam_from_world=many.cam_from_world.clone().requires_grad_()
     )
     lights = scenes.Lights(*(field.clone().requires_grad_() for field in lights))
-    picture = render_mesh(mesh, tracked, lights, background=behind.requires_grad_())
-    for one, other in zip(picture, expected, strict=True):
+    image = render_mesh(mesh, tracked, lights, background=behind.requires_grad_())
+    for one, other in zip(image, expected, strict=True):
         assert torch.equal(one, other)
         assert not one.requires_grad
 
@@ -359,14 +359,14 @@ def test_154_meshes_are_rendered(every):
     many = views(2, 64)
     for path in sorted(folder_of_meshes().glob("*.ply"))[::every]:
         mesh = normalise(load_mesh(path))
-        picture = render_mesh(mesh, many, sun((0.3, 1, 0.2)))
-        assert (picture.mask.float().mean((1, 2)) > 0.01).all(), path.name
-        seen = picture.depth[picture.mask]
+        image = render_mesh(mesh, many, sun((0.3, 1, 0.2)))
+        assert (image.mask.float().mean((1, 2)) > 0.01).all(), path.name
+        seen = image.depth[image.mask]
         # The mesh fits a ball of radius 0.5 at distance 2.
         assert float(seen.min()) > 1.4999, path.name
         assert float(seen.max()) < 2.5001, path.name
-        assert picture.images.isfinite().all()
-        assert float(picture.images.min()) >= 0
-        assert float(picture.images.max()) <= 1
-        lengths = picture.normals.norm(dim=1)[picture.mask]
+        assert image.images.isfinite().all()
+        assert float(image.images.min()) >= 0
+        assert float(image.images.max()) <= 1
+        lengths = image.normals.norm(dim=1)[image.mask]
         torch.testing.assert_close(lengths, torch.ones_like(lengths), rtol=1e-5, atol=0)

@@ -124,7 +124,7 @@ def test_strecha_folders_are_told_apart(scene, tmp_path):
     with pytest.raises(DataError, match="in one folder; found a, b"):
         data.open(tmp_path)
     (tmp_path / "a" / "0001.png").unlink()
-    with pytest.raises(DataError, match=r"finds no picture '0001\.png' beside it"):
+    with pytest.raises(DataError, match=r"finds no image '0001\.png' beside it"):
         data.open(tmp_path / "a")
     Image.new("RGB", (3, 3)).save(tmp_path / "a" / "0001.png")
     with pytest.raises(DataError, match="K of another resolution"):

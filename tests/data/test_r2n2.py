@@ -31,7 +31,7 @@ def refused(folder, match, file=None):
         assert str(caught.value.path).endswith(file)
 
 
-def test_pictures_show_the_ball_where_the_cameras_see_it(written):
+def test_images_show_the_ball_where_the_cameras_see_it(written):
     """A ray that is half a pixel off, or turned the other way, misses the ball's edge or its colours."""
     scene = data.open(written)
     assert (scene.source, scene.category, len(scene)) == ("r2n2", "chair", len(R2N2_VIEWS))
@@ -102,7 +102,7 @@ GOOD = "30 20 0 0.8 25\n"
         (GOOD * 4 + "30 20 0 1e300 25\n", "a distance that is none"),
         (GOOD * 4 + "1e300 20 0 1 25\n", "an angle beyond"),
         (GOOD * 4 + "9" * 5000 + " 20 0 1 25\n", "number too long"),
-        (GOOD * 6, "must name 6 different pictures"),
+        (GOOD * 6, "must name 6 different images"),
         ("\0" + GOOD * 5, "zero byte"),
         (GOOD * 100_000, "larger than the limit"),
     ],

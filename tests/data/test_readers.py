@@ -49,25 +49,25 @@ def test_a_simple_pinhole_camera_has_one_focal_length(scene, tmp_path):
     torch.testing.assert_close(read.cameras.intrinsics[3], expected, rtol=0, atol=0)
 
 
-def test_a_photograph_may_observe_nothing(scene, tmp_path):
+def test_an_image_may_observe_nothing(scene, tmp_path):
     write_colmap(scene, tmp_path, form="text")
     file = tmp_path / "sparse/0/images.txt"
     lines = file.read_text().splitlines()
-    lines[3] = ""  # the observations of the first record, which is the last photograph
+    lines[3] = ""  # the observations of the first record, which is the last image
     file.write_text("\n".join(lines) + "\n")
     counts = [len(observed.points) for observed in data.open(tmp_path).points.observations]
     assert counts == [42, 42, 42, 42, 0]
 
 
-def test_a_photograph_of_another_size_than_its_camera_is_refused(scene, tmp_path):
+def test_an_image_of_another_size_than_its_camera_is_refused(scene, tmp_path):
     read = data.open(write_colmap(scene, tmp_path, form="binary"))
     Image.fromarray(scene.images[1][:, :50]).save(read.paths[1])
     with pytest.raises(DataError, match=r"50 x 72 .* expects 96 x 72"):
         read.load(1)
 
 
-def test_a_photograph_of_24_megapixels_reads_back(tmp_path):
-    path = tmp_path / "photograph.jpg"
+def test_an_image_of_24_megapixels_reads_back(tmp_path):
+    path = tmp_path / "image.jpg"
     Image.new("RGB", (6048, 4032), (255, 255, 255)).save(path)
     assert image_size(path) == (4032, 6048)
     image = data.read_image(path, (4032, 6048))
@@ -126,10 +126,10 @@ def test_what_is_no_scene_is_told_by_what_is_there(scene, tmp_path):
 
     (tmp_path / "empty").mkdir()
     refused(tmp_path / "empty", "is empty")
-    (tmp_path / "pictures").mkdir()
-    Image.fromarray(scene.images[0]).save(tmp_path / "pictures" / "a.png")
-    refused(tmp_path / "pictures", "holds pictures and no file of cameras; cameras are read from a Middlebury")
-    refused(tmp_path / "pictures" / "a.png", "is a picture; name the folder of its cameras")
+    (tmp_path / "images").mkdir()
+    Image.fromarray(scene.images[0]).save(tmp_path / "images" / "a.png")
+    refused(tmp_path / "images", "holds images and no file of cameras; cameras are read from a Middlebury")
+    refused(tmp_path / "images" / "a.png", "is an image; name the folder of its cameras")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").write_text("nothing")
     refused(tmp_path / "other", "holds nothing that can be read; cameras are read from")

@@ -1,4 +1,4 @@
-"""Real photographs with measured geometry: each set's figure is reached through our readers and converters.
+"""Real images with measured geometry: each set's figure is reached through our readers and converters.
 
 The folder is named by ``LSMGEO_TEST_DATA``; the sets themselves cannot be distributed.
 """
@@ -27,7 +27,7 @@ def fundamental(cameras: CameraTensors, first: int, second: int) -> np.ndarray:
 
 
 def epipolar_errors(cameras, images, pairs, *, sampson=False):
-    """Distances in pixels of SIFT matches from their epipolar lines: the mean of both pictures, or Sampson's."""
+    """Distances in pixels of SIFT matches from their epipolar lines: the mean of both images, or Sampson's."""
     sift = cv2.SIFT_create()
     found = {}
     for index in {index for pair in pairs for index in pair}:
@@ -123,12 +123,12 @@ def test_hololens_depth_of_one_frame_is_that_of_another(first, second):
     assert float((errors < 0.02).double().mean()) > 0.97
 
 
-def test_the_motorcycle_s_right_photograph_becomes_the_left_one(tmp_path):
+def test_the_motorcycle_s_right_image_becomes_the_left_one(tmp_path):
     path = real_set("middlebury_motorcycle")
-    pictures = [np.asarray(Image.open(path / f"motorcycle_{side}.png").convert("RGB")) for side in ("left", "right")]
+    images = [np.asarray(Image.open(path / f"motorcycle_{side}.png").convert("RGB")) for side in ("left", "right")]
     disparity = np.load(path / "motorcycle_disp.npz")["arr_0"].astype(np.float32)
     numbers = (994.978, 311.193, 254.877, 31.086, 193.001)
-    written, _ = write_pair(tmp_path, pictures, [disparity, None], numbers)
+    written, _ = write_pair(tmp_path, images, [disparity, None], numbers)
     scene = data.open(written)
     depth = scene.load_depth(0).double()
     K, E = scene.cameras.intrinsics, scene.cameras.cam_from_world

@@ -24,7 +24,7 @@ from lsmgeo.data.shards.shape_sources import split_by_name
 from lsmgeo.errors import DataError, OptionError
 from lsmgeo.scenes import synthetic13
 
-progress_of = sys.modules["lsmgeo.data.render_set"]
+progress_of = sys.modules["lsmgeo.data.shards.render_set"]
 RECIPE = Recipe(seed=3, views=2, size=24, voxels=(8, 16))
 SHAPES, PER_SHARD = 7, 2
 
@@ -301,7 +301,7 @@ def test_without_joblib_one_process_works(tmp_path, capsys, monkeypatch):
 
 
 def test_a_cluster_that_does_not_answer_is_named(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli, "CLUSTER_SECONDS", 0.5)
+    monkeypatch.setattr("lsmgeo.cli.render_command.CLUSTER_SECONDS", 0.5)
     arguments = ["render", "--shapes", "3", "--out", str(tmp_path / "set"), "--cluster", "tcp://127.0.0.1:9"]
     assert cli.main(arguments) == 2
     assert "127.0.0.1:9" in capsys.readouterr().err

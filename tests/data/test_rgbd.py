@@ -24,7 +24,7 @@ def millimetres(depth):
 
 
 def write_rgbd(scene, folder, *, absent=3, digits=9):
-    """The form of HoloLens recordings, its poses rounded; ``absent`` further rows, without pictures, come between."""
+    """The form of HoloLens recordings, its poses rounded; ``absent`` further rows, without images, come between."""
     for name in ("images", "depth"):
         (folder / name).mkdir(parents=True)
     np.savetxt(folder / "K.txt", scene.K[0])
@@ -73,7 +73,7 @@ def test_a_folder_with_a_table_of_poses_reads_back(tmp_path):
     assert data.open(tmp_path / "a" / "poses.txt").names == read.names
 
 
-def test_frames_are_matched_by_name_where_pictures_are_missing(tmp_path):
+def test_frames_are_matched_by_name_where_images_are_missing(tmp_path):
     folder = write_rgbd(SCENE, tmp_path / "a", absent=0)
     (folder / "images" / "00000.png").unlink()
     (folder / "images" / "00002.png").unlink()

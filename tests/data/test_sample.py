@@ -137,7 +137,7 @@ def test_a_batch_passes_a_loader(workers):
 
 
 @pytest.mark.parametrize("form", ["middlebury", "colmap"])
-def test_posed_photographs_become_a_sample(tmp_path, form):
+def test_posed_images_become_a_sample(tmp_path, form):
     scene = make_scene(24, 32)
     folder = tmp_path / "temple"
     folder = write_middlebury(scene, folder) if form == "middlebury" else write_colmap(scene, folder, form="text")
@@ -156,7 +156,7 @@ def test_posed_photographs_become_a_sample(tmp_path, form):
             posed.sample(views)
 
 
-def test_photographs_of_two_sizes_are_no_sample(tmp_path):
+def test_images_of_two_sizes_are_no_sample(tmp_path):
     folder = write_middlebury(make_scene(24, 32), tmp_path)
     Image.new("RGB", (30, 24)).save(folder / "v1.png")
     posed = data.open(folder)

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from lsmgeo import data
-from lsmgeo.data.files import atomic_file, atomic_folder, is_abandoned
+from lsmgeo.data.atomic_files import atomic_file, atomic_folder, is_abandoned
 from lsmgeo.errors import DataError, OptionError
 from tests.data.posed_writers import trimmed, write_plain_cameras, write_transforms
 from tests.data.writers import project, write_colmap
@@ -29,7 +29,7 @@ def check(read, source, atol=1e-12):
 
 
 @pytest.mark.parametrize("form", WRITERS)
-def test_photographs_of_different_sizes_read_back(scene, tmp_path, form):
+def test_images_of_different_sizes_read_back(scene, tmp_path, form):
     source = data.open(write_transforms(scene, tmp_path / "source"))
     folder = WRITERS[form](source, tmp_path / "new" / "folder")
     assert folder == tmp_path / "new" / "folder"
@@ -37,7 +37,7 @@ def test_photographs_of_different_sizes_read_back(scene, tmp_path, form):
     read = data.open(folder)
     assert read.source == form
     check(read, source)
-    # The photographs' own bytes, under the same names however often they are written.
+    # The images' own bytes, under the same names however often they are written.
     assert [path.read_bytes() for path in read.paths] == [path.read_bytes() for path in source.paths]
     again = WRITERS[form](read, tmp_path / "again")
     assert sorted(path.relative_to(again) for path in again.rglob("*")) == sorted(
@@ -114,14 +114,14 @@ def test_a_rotation_that_is_nearly_one_keeps_its_camera_centre(scene, tmp_path, 
     np.testing.assert_array_equal(exact.cameras.cam_from_world[:, :3, :3].numpy(), rounded.R)
 
 
-def test_cameras_alone_stand_beside_their_photographs(scene, tmp_path):
+def test_cameras_alone_stand_beside_their_images(scene, tmp_path):
     source = data.open(write_transforms(scene, tmp_path))
     file = data.write_cameras_json(source, tmp_path / "alone.json")
     check(data.open(file), source)
     with pytest.raises(OptionError, match="must lie below the folder of the file"):
         data.write_cameras_json(source, tmp_path / "elsewhere" / "alone.json")
     bent = data.open(write_transforms(scene, tmp_path / "bent", lambda values: values.update(k1=-0.1)))
-    with pytest.raises(OptionError, match="path must be a folder for photographs taken through a lens"):
+    with pytest.raises(OptionError, match="path must be a folder for images taken through a lens"):
         data.write_cameras_json(bent, tmp_path / "bent" / "alone.json")
 
 
@@ -176,11 +176,11 @@ def test_a_failed_write_leaves_nothing(scene, tmp_path, monkeypatch, form, fault
     assert list((tmp_path / "made").iterdir()) == []
 
 
-def test_two_photographs_of_one_name_are_refused(scene, tmp_path):
+def test_two_images_of_one_name_are_refused(scene, tmp_path):
     source = data.open(write_colmap(scene, tmp_path / "source", form="text"))
     names = ("a b.png", "a_b.png", *source.names[2:])
     source = data.PosedImages(names, source.paths, source.cameras, None, "colmap")
-    with pytest.raises(DataError, match=r"two photographs that would be called 'a_b\.png'"):
+    with pytest.raises(DataError, match=r"two images that would be called 'a_b\.png'"):
         data.write_colmap(source, tmp_path / "out")
     assert len(data.open(data.write_transforms(source, tmp_path / "out"))) == 5
 

@@ -56,9 +56,9 @@ def test_others_read_it(tmp_path):
         np.testing.assert_array_equal(metadata["cameras"]["intrinsics"], shape.K)
         np.testing.assert_array_equal(metadata["cameras"]["cam_from_world"], shape.E)
         for view in range(3):
-            picture = np.array(Image.open(io.BytesIO(found[f"{view:02d}.png"])))
-            np.testing.assert_array_equal(picture[..., :3], shape.pixels[view])
-            np.testing.assert_array_equal(picture[..., 3], 255 * shape.mask[view])
+            image = np.array(Image.open(io.BytesIO(found[f"{view:02d}.png"])))
+            np.testing.assert_array_equal(image[..., :3], shape.pixels[view])
+            np.testing.assert_array_equal(image[..., 3], 255 * shape.mask[view])
             depth = np.array(Image.open(io.BytesIO(found[f"{view:02d}.depth.png"])))
             np.testing.assert_array_equal(depth, shape.steps[view])
         for side, grid in shape.grids.items():
@@ -194,7 +194,7 @@ def test_verifying(tmp_path):
     for length in (0, 1, 511, 512, len(content) // 2, len(content) - 1):
         path.write_bytes(content[:length])
         assert verify_shard(path, SETTINGS) is False
-        with pytest.raises(DataError, match=r"set-000000.json: tells of"):
+        with pytest.raises(DataError, match=r"set-000000.json: belongs to"):
             ShardSet(tmp_path)
     path.write_bytes(content)
     damaged = [index[:length] for length in (0, 1, len(index) // 2, len(index) - 1)]
@@ -354,15 +354,15 @@ def test_what_is_not_read(tmp_path, index, options, match):
 
 def test_backgrounds_from_a_folder(tmp_path):
     shapes = write_set(tmp_path / "set", shards=1)
-    pictures = tmp_path / "pictures"
-    pictures.mkdir()
+    folder = tmp_path / "folder"
+    folder.mkdir()
     v, u = np.mgrid[:30, :50].astype(np.uint8)
-    Image.fromarray(np.stack([4 * u, 4 * v, np.full_like(u, 9)], -1)).save(pictures / "ramp.png")
-    (pictures / "notes.txt").write_text("no picture")
+    Image.fromarray(np.stack([4 * u, 4 * v, np.full_like(u, 9)], -1)).save(folder / "ramp.png")
+    (folder / "notes.txt").write_text("no image")
     shards = ShardSet(tmp_path / "set")
 
     def read(seed):
-        return shards.read(1, occupancy=8, background=pictures, generator=np.random.default_rng(seed))
+        return shards.read(1, occupancy=8, background=folder, generator=np.random.default_rng(seed))
 
     sample = read(0)
     assert torch.equal(sample.images, read(0).images)
@@ -376,10 +376,10 @@ def test_backgrounds_from_a_folder(tmp_path):
             steps = np.diff(values, axis=axis)[1:-1, 1:-1]
             outside = ~(inside[1:, :] | inside[:-1, :] if axis == 0 else inside[:, 1:] | inside[:, :-1])[1:-1, 1:-1]
             assert 3 <= steps[outside].mean() <= 11
-    (pictures / "ramp.png").write_bytes(b"GIF89a")
+    (folder / "ramp.png").write_bytes(b"GIF89a")
     with pytest.raises(DataError, match="not a readable PNG"):
         read(0)
-    (pictures / "ramp.png").unlink()
+    (folder / "ramp.png").unlink()
     with pytest.raises(DataError, match="holds no PNG or JPEG"):
         read(0)
     with pytest.raises(DataError, match="is no folder of backgrounds"):
@@ -415,7 +415,7 @@ def test_names_are_unique_in_a_set(tmp_path):
 
 
 @pytest.mark.parametrize("kind", [RGBA, DEPTH])
-def test_pictures_of_other_writers(kind):
+def test_images_of_other_writers(kind):
     shape = (37, 29, 4) if kind is RGBA else (37, 29)
     rng = np.random.default_rng(0)
     smooth = np.cumsum(rng.integers(0, 3, shape), axis=1) * (1 if kind is RGBA else 300)

@@ -36,7 +36,7 @@ def write_pair(folder, images=None, disparities=None, numbers=(F, CX, CY, DOFFS,
     return folder, np.asarray(disparities) if disparities[1] is not None else disparities
 
 
-def test_the_disparity_moves_each_pixel_to_the_other_picture(tmp_path):
+def test_the_disparity_moves_each_pixel_to_the_other_image(tmp_path):
     folder, disparities = write_pair(tmp_path)
     read = data.open(folder)
     assert read.source == "middlebury-stereo"

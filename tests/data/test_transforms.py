@@ -12,7 +12,7 @@ from lsmgeo import data
 from lsmgeo.errors import DataError
 from tests.data.posed_writers import (
     check_scene,
-    photograph_sky,
+    render_sky,
     see_fisheye,
     see_perspective,
     sky,
@@ -42,7 +42,7 @@ def test_what_is_stated_once_holds_for_all_and_a_frame_overrides_it(scene, tmp_p
     check_scene(data.open(write_transforms(scene, tmp_path, change)), scene, trimmed(scene))
 
 
-def test_an_angle_states_the_focal_length_and_the_middle_is_the_pictures(scene, tmp_path):
+def test_an_angle_states_the_focal_length_and_the_middle_is_the_images(scene, tmp_path):
     def change(values):
         values["camera_angle_x"] = 0.8
         for frame in values["frames"]:
@@ -119,8 +119,8 @@ def test_depth_of_other_sizes_is_taken_at_its_nearest_pixels(scene, tmp_path, si
 
 
 @pytest.mark.parametrize("size", [(20, 15), (45, 57), (1, 59), (43, 59)])
-def test_depth_of_another_shape_than_its_photograph_is_refused(scene, tmp_path, size):
-    with pytest.raises(DataError, match=r"depth\.png.*not of the shape of its photograph, 59 x 45"):
+def test_depth_of_another_shape_than_its_image_is_refused(scene, tmp_path, size):
+    with pytest.raises(DataError, match=r"depth\.png.*not of the shape of its image, 59 x 45"):
         write_depth(scene, tmp_path, np.ones(size, np.uint16)).load_depth(1)
 
 
@@ -133,10 +133,10 @@ LENSES = {
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_a_straightened_photograph_is_what_a_pinhole_camera_sees(scene, tmp_path, model):
+def test_a_straightened_image_is_what_a_pinhole_camera_sees(scene, tmp_path, model):
     see, k, keys = LENSES[model]
     size = scene.size
-    pictures = [photograph_sky(see, scene.K[view] * [[0.45], [0.45], [1]], k, size, scene.R[view]) for view in range(5)]
+    images = [render_sky(see, scene.K[view] * [[0.45], [0.45], [1]], k, size, scene.R[view]) for view in range(5)]
 
     def change(values):
         if model == "is_fisheye":
@@ -149,7 +149,7 @@ def test_a_straightened_photograph_is_what_a_pinhole_camera_sees(scene, tmp_path
             K = scene.K[view] * [[0.45], [0.45], [1]]
             frame |= {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2] + 0.5, "cy": K[1, 2] + 0.5}
 
-    read = data.open(write_transforms(scene, tmp_path, change, pictures))
+    read = data.open(write_transforms(scene, tmp_path, change, images))
     assert len(read.lenses) == 5
     v, u = np.mgrid[: size[0], : size[1]]
     errors, unbent = [], []
@@ -160,7 +160,7 @@ def test_a_straightened_photograph_is_what_a_pinhole_camera_sees(scene, tmp_path
         expected = sky(rays @ scene.R[view])
         found = 255 * read.load(view).permute(1, 2, 0).double().numpy()
         errors.append(np.abs(found - expected))
-        unbent.append(np.abs(pictures[view] - expected))
+        unbent.append(np.abs(images[view] - expected))
     # Grey levels: half of one is rounding, the rest mixes four pixels of a texture that curves.
     assert np.quantile(errors, 0.99) < 3
     assert np.max(errors) < 6
@@ -215,8 +215,8 @@ def scaled(pose):
         (lambda values: values.update(k1=-9.0), "the distortion"),
         (lambda values: values.update(ftheta_p0=1.0), "ftheta_p0 describes a camera"),
         (lambda values: values.update(frames=[]), "frames must be a list of 1 to"),
-        (lambda values: values["frames"].append(values["frames"][0]), "names a photograph twice"),
-        (lambda values: values["frames"][2].update(file_path="images/nobody"), "no such picture, nor one with"),
+        (lambda values: values["frames"].append(values["frames"][0]), "names an image twice"),
+        (lambda values: values["frames"][2].update(file_path="images/nobody"), "no such image, nor one with"),
         (lambda values: values["frames"][2].update(depth_file_path="../../d.png"), "outside its folder"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Scenes written to disk by code that shares nothing with the readers, and pictures traced in numpy."""
+"""Scenes written to disk by code that shares nothing with the readers, and images traced in numpy."""
 
 from __future__ import annotations
 

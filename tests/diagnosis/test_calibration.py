@@ -84,7 +84,7 @@ def with_lenses(truth, change):
 
 
 def test_corners_are_where_they_were_rendered(truth):
-    for (turn, shift), path in zip(poses(), truth.pictures[0], strict=True):
+    for (turn, shift), path in zip(poses(), truth.images[0], strict=True):
         found = find_corners(data.read_image(path), CORNERS)
         expected, _ = cv2.projectPoints(
             board_points(CORNERS), cv2.Rodrigues(turn)[0], shift, INTRINSICS[0], np.array(COEFFICIENTS[0])
@@ -142,7 +142,7 @@ def test_k_of_another_resolution_is_named(truth, scale):
 
 @pytest.mark.parametrize("order", [(1, 2, 3, 4, 5, 6, 0), (1, 0, 2, 3, 4, 5, 6), (6, 5, 4, 3, 2, 1, 0)])
 def test_shuffled_frames_are_named_and_paired(truth, order):
-    first, second = truth.pictures
+    first, second = truth.images
     findings = examine_calibration(replace(truth, pictures=(first, tuple(second[index] for index in order))), HERE)
     assert findings.verdict == "bad"
     assert findings.cause.name == "frames shuffled"
@@ -189,7 +189,7 @@ def one_camera(truth, change=lambda turn, shift: (turn, shift)):
         turn, shift = change(turn, shift)
         rows.append(np.concatenate([cv2.Rodrigues(turn)[0].ravel(), shift * SQUARE]))
     lens = replace(truth.lenses["first"], views=np.array(rows))
-    return Calibration({"left": lens}, None, truth.board, truth.pictures[:1])
+    return Calibration({"left": lens}, None, truth.board, truth.images[:1])
 
 
 VIEWS = {
@@ -206,7 +206,7 @@ def test_stated_poses_of_the_board_are_compared(truth):
     for name, change in VIEWS.items():
         findings = examine_calibration(one_camera(truth, change), HERE)
         assert findings.cause.name == name
-    turned = replace(one_camera(truth), pictures=(truth.pictures[0][1:] + truth.pictures[0][:1],))
+    turned = replace(one_camera(truth), images=(truth.images[0][1:] + truth.images[0][:1],))
     assert examine_calibration(turned, HERE).cause.name == "frames shuffled"
 
 
@@ -218,7 +218,7 @@ def test_what_cannot_be_measured_is_unknown(truth, tmp_path):
     findings = examine_calibration(replace(truth, pictures=((tmp_path / "a.png",),)), HERE)
     assert findings.verdict == "unknown"
     assert findings.gap.reason == "no board was found in 1 picture of the camera"
-    few = replace(truth, pictures=tuple(side[:2] for side in truth.pictures))
+    few = replace(truth, images=tuple(side[:2] for side in truth.images))
     findings = examine_calibration(few, HERE)
     assert "Too few pictures" in findings.remarks[0]
     assert set(values(findings)) == {"rms under the lens first", "rms under the lens second"}

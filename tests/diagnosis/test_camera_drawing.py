@@ -6,7 +6,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lsmgeo.data.posed import Voxels
+from lsmgeo.data.posed_images import Voxels
 from lsmgeo.diagnosis.camera_drawing import Content, draw_cameras, surface_of
 from lsmgeo.diagnosis.two_view_geometry import Geometry
 from lsmgeo.grids import VoxelGrid

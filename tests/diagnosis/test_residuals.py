@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lsmgeo.data.posed import Observations, SparsePoints, Voxels
+from lsmgeo.data.posed_images import Observations, SparsePoints, Voxels
 from lsmgeo.diagnosis.depth_consistency import Surfaces, best_neighbour_errors, relative_errors
 from lsmgeo.diagnosis.feature_matching import Matches
 from lsmgeo.diagnosis.findings import Check, badness

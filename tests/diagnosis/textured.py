@@ -12,7 +12,7 @@ from PIL import Image
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.data import PosedImages
 from lsmgeo.data.formats.depth_files import DepthFile
-from lsmgeo.data.posed import Observations, SparsePoints, Voxels
+from lsmgeo.data.posed_images import Observations, SparsePoints, Voxels
 from lsmgeo.grids import VoxelGrid
 
 HEIGHT, WIDTH = 240, 320

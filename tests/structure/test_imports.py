@@ -134,6 +134,7 @@ def test_old_places_name_the_new_ones(name):
 
 
 OLD_NAMES = [
+    ("lsmgeo.data", "Made", "SetResult"),
     ("lsmgeo.evaluation", "Contender", "Method"),
     ("lsmgeo.evaluation", "open_contenders", "open_methods"),
 ]

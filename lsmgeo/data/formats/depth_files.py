@@ -1,4 +1,4 @@
-"""Depth that comes beside a photograph, as camera z in world units, and portable float maps."""
+"""Depth that comes beside an image, as camera z in world units, and portable float maps."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lsmgeo.data.files import MAX_NUMBER_LENGTH, read_bytes
 from lsmgeo.data.images import DEPTH, MAX_PIXELS, decode_png, image_size
+from lsmgeo.data.read_files import MAX_NUMBER_LENGTH, read_bytes
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ HEADER = re.compile(rb"(P[fF])\s+(\d{1,9})\s+(\d{1,9})\s+(\S{1,%d})[ \t]*\r?\n" 
 
 
 class DepthFile(ABC):
-    """Something that reads the depth of one photograph."""
+    """Something that reads the depth of one image."""
 
     path: Path
 
@@ -47,7 +47,7 @@ class DepthPng(DepthFile):
         path: the file.
         step: world units of one step.
         empty: values that mean that there is no depth.
-        any_size: whether a map of the photograph's shape but with more or fewer pixels is taken, its nearest pixels
+        any_size: whether a map of the image's shape but with more or fewer pixels is taken, its nearest pixels
             without any mixing: pixel i of N has the value of the map's pixel floor((i + 0.5) n / N).
     """
 
@@ -75,8 +75,7 @@ class DepthPng(DepthFile):
         if abs(height - width * size[0] / size[1]) > 1:
             raise DataError(
                 self.path,
-                f"is {width} x {height} pixels (width x height), not of the shape of its photograph, "
-                f"{size[1]} x {size[0]}",
+                f"is {width} x {height} pixels (width x height), not of the shape of its image, {size[1]} x {size[0]}",
             )
         return height, width
 

@@ -6,20 +6,20 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from lsmgeo.data.files import refuse_unreadable
-from lsmgeo.data.formats.calibration import is_calibration, read_calibration
-from lsmgeo.data.formats.depth_sensors import is_rgbd, is_seven_scenes, read_rgbd, read_seven_scenes
 from lsmgeo.data.formats.format_binvox import is_binvox, read_binvox
 from lsmgeo.data.formats.format_cameras_json import is_cameras_json, read_cameras_json
-from lsmgeo.data.formats.format_colmap import model_folder, read_colmap
+from lsmgeo.data.formats.format_colmap import is_colmap, read_colmap
 from lsmgeo.data.formats.format_llff import is_llff, read_llff
 from lsmgeo.data.formats.format_lsm import is_lsm, read_lsm
 from lsmgeo.data.formats.format_middlebury import is_middlebury, is_stereo_pair, read_middlebury, read_stereo_pair
+from lsmgeo.data.formats.format_opencv import is_calibration, read_calibration
 from lsmgeo.data.formats.format_r2n2 import is_r2n2, read_r2n2
+from lsmgeo.data.formats.format_rgbd import is_rgbd, is_seven_scenes, read_rgbd, read_seven_scenes
 from lsmgeo.data.formats.format_strecha import is_strecha, read_strecha
 from lsmgeo.data.formats.format_transforms import is_transforms, read_transforms
 from lsmgeo.data.images import SUFFIXES
-from lsmgeo.data.posed import PosedImages
+from lsmgeo.data.posed_images import PosedImages
+from lsmgeo.data.read_files import file_reader
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class Format(NamedTuple):
 
     Attributes:
         name: what `PosedImages.source` says.
-        kind: what it holds: posed photographs, voxels alone, or the calibration of cameras.
+        kind: what it holds: posed images, voxels alone, or the calibration of cameras.
         needs: what a folder of it holds, for the message when nothing is found.
         is_here: whether a path, file or folder, is of this format. Looks at names and, where these do not decide, at
             the beginning of a file; never raises anything but OSError and DataError.
@@ -58,18 +58,14 @@ class Format(NamedTuple):
     read: Callable[[Path], Any]
 
 
-def _is_colmap(path: Path) -> bool:
-    return path.is_dir() and model_folder(path) is not None
-
-
-def _is_solid(path: Path) -> bool:
+def _is_only_binvox(path: Path) -> bool:
     # 3D-R2N2 puts the voxels of an object beside its renderings.
     return is_binvox(path) and not (path.is_dir() and is_r2n2(path))
 
 
 FORMATS = (
     Format("middlebury", "photographs", "a Middlebury *_par.txt", is_middlebury, read_middlebury),
-    Format("colmap", "photographs", "a COLMAP model (cameras and images, .bin or .txt)", _is_colmap, read_colmap),
+    Format("colmap", "photographs", "a COLMAP model (cameras and images, .bin or .txt)", is_colmap, read_colmap),
     Format("rgbd", "photographs", "K.txt, poses.txt and frame_index.txt of an RGB-D set", is_rgbd, read_rgbd),
     Format("7-scenes", "photographs", "frame-*.pose.txt of 7-Scenes", is_seven_scenes, read_seven_scenes),
     Format("middlebury-stereo", "photographs", "calib.txt and im0.png of a pair", is_stereo_pair, read_stereo_pair),
@@ -80,11 +76,11 @@ FORMATS = (
     Format("opencv", "calibration", "calibration files of OpenCV's FileStorage", is_calibration, read_calibration),
     Format("lsm", "photographs", "render_*.png and camera_*.mat of the LSM release", is_lsm, read_lsm),
     Format("r2n2", "photographs", "rendering_metadata.txt of 3D-R2N2", is_r2n2, read_r2n2),
-    Format("binvox", "voxels", "a *.binvox file", _is_solid, read_binvox),
+    Format("binvox", "voxels", "a *.binvox file", _is_only_binvox, read_binvox),
 )
 
 
-@refuse_unreadable
+@file_reader
 def detect(path: str | Path) -> Format:
     """Tell the format from what a folder holds, or from a file.
 
@@ -105,27 +101,27 @@ def detect(path: str | Path) -> Format:
 
 def _why_nothing(path: Path) -> str:
     """What is said of a path in which no format is found: the likely slip first."""
-    pictures, others = [], False
+    images, others = [], False
     for item in islice(path.iterdir(), MOST_LOOKED_AT) if path.is_dir() else [path]:
         if item.suffix.lower() in SUFFIXES:
-            pictures.append(item)
-        others = others or item not in pictures
-    if path.is_file() and pictures:
-        return "is a picture; name the folder of its cameras"
-    if not pictures and not others:
+            images.append(item)
+        others = others or item not in images
+    if path.is_file() and images:
+        return "is an image; name the folder of its cameras"
+    if not images and not others:
         return "is empty"
     for pattern in TREES:
         inside = next(path.glob(pattern), None) if path.is_dir() else None
         if inside is not None:
             return f"is a tree of many objects; name one of them, such as {inside.parent}, or convert it to shards"
     known = f"cameras are read from {', '.join(candidate.needs for candidate in FORMATS)}"
-    if pictures and not others:
-        return f"holds pictures and no file of cameras; {known}"
+    if images and not others:
+        return f"holds images and no file of cameras; {known}"
     return f"holds nothing that can be read; {known}"
 
 
 def open_scene(path: str | Path) -> PosedImages:
-    """Open posed photographs; the format is told from the files that a folder holds, or from the file named.
+    """Open posed images; the format is told from the files that a folder holds, or from the file named.
 
     Convention:
         Whatever the source's, the cameras come world-to-camera, OpenCV axes, integer pixel centres.
@@ -134,13 +130,13 @@ def open_scene(path: str | Path) -> PosedImages:
         path: the scene's folder; or its file of cameras, where a folder holds several.
 
     Returns:
-        The photographs with cameras, and the points, depth and voxels that the source has.
+        The images with cameras, and the points, depth and voxels that the source has.
 
     Raises:
         DataError: there is no such path, it is of no known format or of several, or its reader refuses it.
     """
     found = detect(path)
     if found.kind != "photographs":
-        raise DataError(path, f"holds {found.needs}, no posed photographs")
+        raise DataError(path, f"holds {found.needs}, no posed images")
     scene: PosedImages = found.read(Path(path))
     return scene

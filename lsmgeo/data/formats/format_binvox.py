@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from lsmgeo._checks import check_choice
-from lsmgeo.data.files import one_file, parse_floats, parse_ints, plain_files, read_bytes, refuse_unreadable
-from lsmgeo.data.posed import Voxels
+from lsmgeo.data.posed_images import Voxels
+from lsmgeo.data.read_files import file_reader, one_file, parse_floats, parse_ints, plain_files, read_bytes
 from lsmgeo.errors import DataError, LsmGeoError
 from lsmgeo.grids import VoxelGrid
 
@@ -39,7 +39,7 @@ def is_binvox(path: Path) -> bool:
         return stream.read(len(SIGNATURE)) == SIGNATURE
 
 
-@refuse_unreadable
+@file_reader
 def read_binvox(path: str | Path, *, placement: str = "header") -> Voxels:
     """Read a binvox file.
 

@@ -11,14 +11,15 @@ import numpy as np
 
 from lsmgeo._checks import describe
 from lsmgeo.cameras import CameraTensors
-from lsmgeo.data.files import child, refuse_unreadable
 from lsmgeo.data.formats.depth_files import DepthPng
+from lsmgeo.data.formats.scene_assembly import assemble, check_camera, check_image_size, check_last_row, make_cameras
 from lsmgeo.data.images import has_alpha, image_size
-from lsmgeo.data.json_files import peek_json, read_json, take_array, take_number, take_text
-from lsmgeo.data.posed import PosedImages, assemble, check_camera, check_last_row, check_picture, make_cameras
+from lsmgeo.data.json_files import read_array, read_json, read_number, read_string, sniff_json
+from lsmgeo.data.posed_images import PosedImages
+from lsmgeo.data.read_files import file_reader, path_inside
 from lsmgeo.errors import DataError
 
-__all__ = ["NAME", "is_cameras_json", "read_cameras_json", "state_camera", "state_cameras"]
+__all__ = ["NAME", "camera_entry", "encode_cameras", "is_cameras_json", "read_cameras_json"]
 
 NAME = "cameras.json"
 FORMAT = "lsmgeo cameras"
@@ -32,14 +33,14 @@ def is_cameras_json(path: Path) -> bool:
     file = path / NAME if path.is_dir() else path
     if file.suffix.lower() != ".json" or not file.is_file():
         return False
-    values = peek_json(file)
+    values = sniff_json(file)
     cameras = values.get("cameras")
     return values.get("format") == FORMAT or (
         isinstance(cameras, list) and bool(cameras) and isinstance(cameras[0], dict) and "K" in cameras[0]
     )
 
 
-@refuse_unreadable
+@file_reader
 def read_cameras_json(path: str | Path) -> PosedImages:
     """Read cameras from a plain JSON file.
 
@@ -64,7 +65,7 @@ def read_cameras_json(path: str | Path) -> PosedImages:
         }
 
     A file without ``format`` is taken for one of version 1, ``name`` for ``file``, and ``R`` (3 x 3) with ``t`` (3) for
-    ``cam_from_world``. ``depth`` may be left out: it is a 16-bit PNG of the photograph's size that counts steps of
+    ``cam_from_world``. ``depth`` may be left out: it is a 16-bit PNG of the image's size that counts steps of
     camera z, ``depth_step`` world units each, 0 where there is none.
 
     Convention:
@@ -75,11 +76,11 @@ def read_cameras_json(path: str | Path) -> PosedImages:
         path: the file, or a folder with ``cameras.json``.
 
     Returns:
-        The photographs with their cameras and depth, cut out where any of them has alpha; no sparse points.
+        The images with their cameras and depth, cut out where any of them has alpha; no sparse points.
 
     Raises:
         DataError: a file is missing, damaged or too large, names a file outside its folder, is of another version, or
-            states a camera that makes no sense or is of another size than its picture.
+            states a camera that makes no sense or is of another size than its image.
     """
     path = Path(path)
     file = path / NAME if path.is_dir() else path
@@ -101,11 +102,11 @@ def read_cameras_json(path: str | Path) -> PosedImages:
         where = f"camera {view}"
         if not isinstance(entry, dict):
             raise DataError(file, f"{where}: expected an object; got {describe(entry)}")
-        names.append(take_text(entry, "file" if "file" in entry else "name", file, where))
-        paths.append(child(file.parent, names[-1], file))
+        names.append(read_string(entry, "file" if "file" in entry else "name", file, where))
+        paths.append(path_inside(file.parent, names[-1], file))
         sizes.append(image_size(paths[-1]))
-        check_picture(_size(entry, file, where), sizes[-1], paths[-1], file, where)
-        intrinsics[view] = take_array(entry, "K", (3, 3), file, where)
+        check_image_size(_size(entry, file, where), sizes[-1], paths[-1], file, where)
+        intrinsics[view] = read_array(entry, "K", (3, 3), file, where)
         poses[view] = _pose(entry, file, where)
         check_camera(intrinsics[view], poses[view, :, :3], file, where)
         depths.append(_depth(entry, file, where))
@@ -116,14 +117,14 @@ def read_cameras_json(path: str | Path) -> PosedImages:
 def _depth(entry: dict[str, Any], file: Path, where: str) -> DepthPng | None:
     if "depth" not in entry:
         return None
-    step = take_number(entry, "depth_step", file, where)
+    step = read_number(entry, "depth_step", file, where)
     if not step > 0:
         raise DataError(file, f"{where}: depth_step must be positive; got {step:g}")
-    return DepthPng(child(file.parent, take_text(entry, "depth", file, where), file), step)
+    return DepthPng(path_inside(file.parent, read_string(entry, "depth", file, where), file), step)
 
 
 def _size(entry: dict[str, Any], file: Path, where: str) -> tuple[int, int]:
-    height, width = (take_number(entry, key, file, where) for key in ("height", "width"))
+    height, width = (read_number(entry, key, file, where) for key in ("height", "width"))
     if height != round(height) or width != round(width):
         raise DataError(file, f"{where}: height and width must be whole numbers of pixels")
     return int(height), int(width)
@@ -132,20 +133,20 @@ def _size(entry: dict[str, Any], file: Path, where: str) -> tuple[int, int]:
 def _pose(entry: dict[str, Any], file: Path, where: str) -> np.ndarray:
     """World-to-camera, (3, 4)."""
     if "cam_from_world" not in entry and "R" in entry:
-        R, t = take_array(entry, "R", (3, 3), file, where), take_array(entry, "t", (3,), file, where)
+        R, t = read_array(entry, "R", (3, 3), file, where), read_array(entry, "t", (3,), file, where)
         return np.column_stack((R, t))
-    pose = take_array(entry, "cam_from_world", (4, 4), file, where)
+    pose = read_array(entry, "cam_from_world", (4, 4), file, where)
     check_last_row(pose, file, f"{where}: cam_from_world")
     return pose[:3]
 
 
-def state_camera(camera: CameraTensors) -> dict[str, Any]:
+def camera_entry(camera: CameraTensors) -> dict[str, Any]:
     """What a file says of one camera, leading shape (); nothing is rounded."""
     K, E = (part.double().tolist() for part in camera[:2])
     return {"width": int(camera.width), "height": int(camera.height), "K": K, "cam_from_world": E}
 
 
-def state_cameras(entries: Sequence[Mapping[str, Any]]) -> bytes:
+def encode_cameras(entries: Sequence[Mapping[str, Any]]) -> bytes:
     """The content of a file of cameras, whose pixel centres are integer."""
     values = {"format": FORMAT, "version": VERSION, "pixel_center": "integer", "cameras": entries}
     return json.dumps(values, indent=1, allow_nan=False).encode()

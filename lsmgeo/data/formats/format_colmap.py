@@ -14,15 +14,24 @@ import numpy as np
 import torch
 
 from lsmgeo.cameras import from_colmap
-from lsmgeo.data.files import MAX_TEXT_BYTES, child, parse_floats, parse_ints, read_bytes, read_text, refuse_unreadable
 from lsmgeo.data.formats.lenses import Lens
-from lsmgeo.data.posed import Observations, PosedImages, SparsePoints, as_data_error, assemble
+from lsmgeo.data.formats.scene_assembly import assemble, camera_errors_as_data_errors
+from lsmgeo.data.posed_images import Observations, PosedImages, SparsePoints
+from lsmgeo.data.read_files import (
+    MAX_TEXT_BYTES,
+    file_reader,
+    parse_floats,
+    parse_ints,
+    path_inside,
+    read_bytes,
+    read_text,
+)
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["model_folder", "read_colmap"]
+__all__ = ["is_colmap", "read_colmap"]
 
 MAX_CAMERA_BYTES = 1 << 24
 MAX_MODEL_BYTES = 1 << 31
@@ -62,30 +71,35 @@ def model_folder(path: Path) -> tuple[Path, str] | None:
     return None
 
 
-@refuse_unreadable
+def is_colmap(path: Path) -> bool:
+    """Whether a folder holds a COLMAP model."""
+    return path.is_dir() and model_folder(path) is not None
+
+
+@file_reader
 def read_colmap(path: str | Path, images: str | Path | None = None) -> PosedImages:
-    """Read a COLMAP model; photographs with distortion are straightened.
+    """Read a COLMAP model; images with distortion are straightened.
 
     The model (``cameras``, ``images`` and, where it exists, ``points3D``, binary or text) is looked for in the folder,
-    in ``sparse``, ``sparse/0`` and ``0``; the photographs in ``images`` in it or in up to three folders above, else in
-    the folder itself. Photographs are ordered by name. Its files of rigs and frames repeat the photographs' poses and
+    in ``sparse``, ``sparse/0`` and ``0``; the images in ``images`` in it or in up to three folders above, else in
+    the folder itself. Images are ordered by name. Its files of rigs and frames repeat the images' poses and
     are not read.
 
     Convention:
         COLMAP's poses are world-to-camera with OpenCV axes, as ours. Its pixel centres are half-integer: principal
         points and observations lose 0.5. The models that OpenCV has become a `Lens`, and observations move to where
-        the straightened photograph shows them; one that it cannot show is left out.
+        the straightened image shows them; one that it cannot show is left out.
 
     Args:
         path: the scene's folder or the model's.
-        images: folder of the photographs, where it is elsewhere.
+        images: folder of the images, where it is elsewhere.
 
     Returns:
-        The photographs with cameras and sparse points.
+        The images with cameras and sparse points.
 
     Raises:
         DataError: no model, a damaged or inconsistent one, a camera model that OpenCV lacks, or a name that leads
-            outside the folder of photographs.
+            outside the folder of images.
     """
     path = Path(path)
     found = model_folder(path)
@@ -95,7 +109,7 @@ def read_colmap(path: str | Path, images: str | Path | None = None) -> PosedImag
     model = _read_model(folder, form)
     file = folder / f"images.{form}"
     if not model.images:
-        raise DataError(file, "holds no photograph")
+        raise DataError(file, "holds no image")
     entries = sorted(model.images, key=lambda entry: entry.name)
     root = Path(images) if images is not None else _image_folder(path, folder)
 
@@ -105,9 +119,9 @@ def read_colmap(path: str | Path, images: str | Path | None = None) -> PosedImag
         camera = model.cameras.get(entry.camera_id)
         if camera is None:
             raise DataError(file, f"{entry.name[:80]!r} refers to camera {entry.camera_id}, which does not exist")
-        paths.append(child(root, entry.name, file))
+        paths.append(path_inside(root, entry.name, file))
         used.append(camera)
-    with as_data_error(file):
+    with camera_errors_as_data_errors(file):
         cameras = from_colmap(
             torch.from_numpy(np.stack([camera.intrinsics() for camera in used])),
             torch.from_numpy(np.stack([entry.quaternion for entry in entries])),
@@ -199,7 +213,7 @@ class ColmapCamera:
 
 @dataclass(frozen=True, eq=False)
 class ColmapImage:
-    """One photograph as COLMAP states it; a point id of -1 belongs to no point."""
+    """One image as COLMAP states it; a point id of -1 belongs to no point."""
 
     image_id: int
     camera_id: int
@@ -234,7 +248,7 @@ def _read_model(folder: Path, form: str) -> ColmapModel:
     path = folder / f"images.{form}"
     images = list(read_images(path))
     if len({image.image_id for image in images}) != len(images):
-        raise DataError(path, "uses a photograph's id twice")
+        raise DataError(path, "uses an image's id twice")
     for image in images:
         norm = float(np.linalg.norm(image.quaternion))
         if not abs(norm - 1) < 1e-2:
@@ -336,7 +350,7 @@ def _binary_points(path: Path) -> Iterator[tuple[int, tuple[float, ...], tuple[i
     cursor = _Cursor(path, MAX_MODEL_BYTES)
     for _ in cursor.records(43 + 8):
         point_id, *values, _ = cursor.take("<q3d3Bd")
-        # The track repeats what the photographs' own observations say; it is stepped over, here and in the text.
+        # The track repeats what the images' own observations say; it is stepped over, here and in the text.
         cursor.array(TRACK_ELEMENT)
         yield point_id, tuple(values[:3]), tuple(values[3:])
 
@@ -362,7 +376,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
     lines = _numbered_lines(path, MAX_TEXT_BYTES)
-    # A photograph takes two lines, and the second is empty where it observes nothing: only blank lines before the
+    # An image takes two lines, and the second is empty where it observes nothing: only blank lines before the
     # first record and after the last may be dropped.
     while lines and not lines[0][1].strip():
         lines.pop(0)

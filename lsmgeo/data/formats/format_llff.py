@@ -1,4 +1,4 @@
-"""LLFF's ``poses_bounds.npy``: one row a photograph, in the order of the photographs' names."""
+"""LLFF's ``poses_bounds.npy``: one row an image, in the order of the images' names."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lsmgeo.data.files import child, refuse_unreadable
+from lsmgeo.data.formats.scene_assembly import MAX_PARAMETER, MAX_SIDE, assemble, check_rotation, make_cameras
 from lsmgeo.data.images import SUFFIXES, has_alpha, image_size
-from lsmgeo.data.posed import MAX_PARAMETER, MAX_SIDE, PosedImages, assemble, check_rotation, make_cameras
+from lsmgeo.data.posed_images import PosedImages
+from lsmgeo.data.read_files import file_reader, path_inside
 from lsmgeo.errors import DataError
 
 __all__ = ["is_llff", "read_llff"]
@@ -34,28 +35,28 @@ def is_llff(path: Path) -> bool:
         return False
 
 
-@refuse_unreadable
+@file_reader
 def read_llff(path: str | Path) -> PosedImages:
-    """Read a scene of LLFF, which NeRF's forward-facing and mip-NeRF 360's photographs share.
+    """Read a scene of LLFF, which NeRF's forward-facing and mip-NeRF 360's images share.
 
     A row is a 3 x 5 matrix ``[R | centre | (height, width, focal length)]``, camera-to-world, and the nearest and
     farthest depth, which are left out here. (Mildenhall et al., "Local Light Field Fusion", SIGGRAPH 2019.) The
-    photographs are those of ``images``, else of ``images_2``, ``images_4`` or ``images_8``, sorted by name.
+    images are those of ``images``, else of ``images_2``, ``images_4`` or ``images_8``, sorted by name.
 
     Convention:
         The columns of R are the camera's down, right and back; they become right, down, forward, and the pose
-        world-to-camera. The principal point is the picture's middle, half-integer: ((width - 1) / 2,
-        (height - 1) / 2) here. Where a photograph has another size than its row, K follows the photograph by
+        world-to-camera. The principal point is the image's middle, half-integer: ((width - 1) / 2,
+        (height - 1) / 2) here. Where an image has another size than its row, K follows the image by
         the rule for resizing, ``f' = f w' / w``.
 
     Args:
         path: the scene's folder, or its ``poses_bounds.npy``.
 
     Returns:
-        The photographs with their cameras, no sparse points.
+        The images with their cameras, no sparse points.
 
     Raises:
-        DataError: a file is missing, damaged or too large, a row makes no sense, there are more or fewer photographs
+        DataError: a file is missing, damaged or too large, a row makes no sense, there are more or fewer images
             than rows, or one has another shape than its row.
     """
     path = Path(path)
@@ -65,26 +66,24 @@ def read_llff(path: str | Path) -> PosedImages:
         raise DataError(file, f"must hold rows of {COLUMNS} numbers; got an array of {rows.shape}")
     if not (np.abs(rows) < 1e12).all():
         raise DataError(file, "holds a number that is not finite or beyond 1e12")
-    paths = _pictures(file)
+    paths = _images(file)
     if len(paths) != len(rows):
-        found = (
-            f"{len(paths)} pictures are in {paths[0].parent.name!r}" if paths else "no folder images holds a picture"
-        )
+        found = f"{len(paths)} images are in {paths[0].parent.name!r}" if paths else "no folder images holds an image"
         raise DataError(file, f"has {len(rows)} rows, and {found}")
 
     matrices = rows[:, :15].reshape(-1, 3, 5)
     down, right, back = (matrices[:, :, column] for column in range(3))
     world_from_cam = np.stack((right, down, -back), -1)
     intrinsics, sizes = np.zeros((len(rows), 3, 3)), []
-    for view, picture in enumerate(paths):
+    for view, image in enumerate(paths):
         where = f"row {view}"
         check_rotation(world_from_cam[view], file, where)
-        sizes.append(image_size(picture))
-        intrinsics[view] = _intrinsics(matrices[view, :, 4], sizes[-1], file, f"{where} ({picture.name!r})")
+        sizes.append(image_size(image))
+        intrinsics[view] = _intrinsics(matrices[view, :, 4], sizes[-1], file, f"{where} ({image.name!r})")
     R = world_from_cam.transpose(0, 2, 1)
     t = -(R @ matrices[:, :, 3:4])[..., 0]
     cameras = make_cameras(intrinsics, R, t, sizes, file, pixel_center="half")
-    names = [picture.name for picture in paths]
+    names = [image.name for image in paths]
     return assemble(names, paths, cameras, "llff", file=file, cut_out=any(map(has_alpha, paths)))
 
 
@@ -106,27 +105,27 @@ def _read_array(file: Path) -> np.ndarray:
     return np.array(array, np.float64)
 
 
-def _pictures(file: Path) -> list[Path]:
-    """The pictures of the first folder that there is, sorted by name."""
+def _images(file: Path) -> list[Path]:
+    """The images of the first folder that there is, sorted by name."""
     for name in ("images", *REDUCED):
         folder = file.parent / name
         if folder.is_dir():
-            # A name with a dot in front is no photograph: macOS leaves such files beside each of them.
+            # A name with a dot in front is no image: macOS leaves such files beside each of them.
             seen = (path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
             found = sorted(name for name in seen if not name.startswith("."))
-            return [child(file.parent, f"{name}/{picture}", file) for picture in found]
+            return [path_inside(file.parent, f"{name}/{image}", file) for image in found]
     return []
 
 
 def _intrinsics(stated: np.ndarray, size: tuple[int, int], file: Path, where: str) -> np.ndarray:
-    """K with half-integer pixel centres of a photograph, whatever resolution its row is of."""
+    """K with half-integer pixel centres of an image, whatever resolution its row is of."""
     height, width, focal = (float(value) for value in stated)
     if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE and 0 < focal <= MAX_PARAMETER):
         reason = f"{width:g} x {height:g} pixels (width x height) and a focal length of {focal:g} make no camera"
         raise DataError(file, f"{where}: {reason}")
     down, across = size[0] / height, size[1] / width
-    # A reduced picture's sides are whole numbers, so they may miss the exact ratio by a pixel, no more.
+    # A reduced image's sides are whole numbers, so they may miss the exact ratio by a pixel, no more.
     if abs(size[1] - down * width) > 1 + width / height:
-        reason = f"the row is of {width:g} x {height:g} pixels and the picture has {size[1]} x {size[0]}"
+        reason = f"the row is of {width:g} x {height:g} pixels and the image has {size[1]} x {size[0]}"
         raise DataError(file, f"{where}: {reason} (width x height): another shape, so K cannot follow")
     return np.array([[focal * across, 0, size[1] / 2], [0, focal * down, size[0] / 2], [0, 0, 1]])

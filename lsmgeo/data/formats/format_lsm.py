@@ -12,21 +12,22 @@ import numpy as np
 import torch
 
 from lsmgeo._checks import check_choice
-from lsmgeo.data.files import child, refuse_unreadable
 from lsmgeo.data.formats.depth_files import DepthPng
 from lsmgeo.data.formats.mat_files import parse_mat
+from lsmgeo.data.formats.scene_assembly import assemble, check_camera, check_last_row, make_cameras
+from lsmgeo.data.formats.synsets import synset_category
 from lsmgeo.data.images import image_size
-from lsmgeo.data.isolated import isolated
-from lsmgeo.data.posed import PosedImages, Voxels, assemble, check_camera, check_last_row, make_cameras
-from lsmgeo.data.shards.shape_sources import spell_synset
-from lsmgeo.data.shards.shard_metadata import MAX_VIEWS
+from lsmgeo.data.isolated import parse_isolated
+from lsmgeo.data.posed_images import PosedImages, Voxels
+from lsmgeo.data.read_files import file_reader, path_inside
+from lsmgeo.data.sample import MAX_VIEWS
 from lsmgeo.errors import DataError, OptionError
 from lsmgeo.grids import VoxelGrid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["is_lsm", "read_lsm", "read_lsm_object", "read_mats"]
+__all__ = ["is_lsm", "read_lsm", "read_lsm_object", "read_mat_files"]
 
 RENDER = re.compile(r"render_(0|[1-9][0-9]{0,4})\.png")
 RESOLUTIONS = (32, 64)
@@ -48,7 +49,7 @@ def is_lsm(path: Path) -> bool:
     return renders and cameras
 
 
-@refuse_unreadable
+@file_reader
 def read_lsm(path: str | Path, *, voxels: int = 32) -> PosedImages:
     """Read one object of the LSM release: ``renders/SYNSET/MODEL``, its voxels beside ``renders``.
 
@@ -88,16 +89,18 @@ def read_lsm_object(folder: Path, resolutions: Sequence[int]) -> tuple[PosedImag
         root = folder.resolve().parents[2]
         synset, model = folder.resolve().parts[-2:]
         files = [(side, root / "voxels" / f"modelVoxels{side}" / synset / f"{model}.mat") for side in resolutions]
-        volumes = [(side, child(root, str(file.relative_to(root)), folder)) for side, file in files if file.exists()]
+        volumes = [
+            (side, path_inside(root, str(file.relative_to(root)), folder)) for side, file in files if file.exists()
+        ]
     except (OSError, RuntimeError, IndexError, ValueError) as error:
         if isinstance(error, DataError):
             raise
         raise DataError(folder, f"cannot be read ({error})") from error
     if not 1 <= len(views) <= MAX_VIEWS:
         raise DataError(folder, f"must hold render_0.png and so on, {MAX_VIEWS} views at most; found {len(views)}")
-    cameras = [child(folder, f"camera_{view}.mat", folder) for view in views]
+    cameras = [path_inside(folder, f"camera_{view}.mat", folder) for view in views]
     arrays = []
-    for found in read_mats([*cameras, *(file for _, file in volumes)]):
+    for found in read_mat_files([*cameras, *(file for _, file in volumes)]):
         if isinstance(found, DataError):
             raise found
         arrays.append(found)
@@ -106,7 +109,7 @@ def read_lsm_object(folder: Path, resolutions: Sequence[int]) -> tuple[PosedImag
     return _scene(folder, views, list(zip(cameras, arrays[: len(views)], strict=True))), grids
 
 
-def read_mats(paths: Sequence[Path]) -> list[Arrays | DataError]:
+def read_mat_files(paths: Sequence[Path]) -> list[Arrays | DataError]:
     """Read K, extrinsic and Volume from MATLAB files up to version 7.2, as far as each holds them.
 
     Returns:
@@ -116,8 +119,8 @@ def read_mats(paths: Sequence[Path]) -> list[Arrays | DataError]:
         OptionError: SciPy is missing.
     """
     if find_spec("scipy") is None:
-        raise OptionError("read_mats: MATLAB files need SciPy; install lsmgeo[data]")
-    results = isolated(parse_mat, paths, limit=MAX_MAT_BYTES, memory=MEMORY, seconds=SECONDS)
+        raise OptionError("read_mat_files: MATLAB files need SciPy; install lsmgeo[data]")
+    results = parse_isolated(parse_mat, paths, limit=MAX_MAT_BYTES, memory=MEMORY, seconds=SECONDS)
     for number, (path, found) in enumerate(zip(paths, results, strict=True)):
         if isinstance(found, dict):
             for name, array in found.items():
@@ -128,8 +131,8 @@ def read_mats(paths: Sequence[Path]) -> list[Arrays | DataError]:
 
 def _scene(folder: Path, views: Sequence[int], cameras: Sequence[tuple[Path, Arrays]]) -> PosedImages:
     K, E, sizes, depths = [], [], [], []
-    paths = [child(folder, f"render_{view}.png", folder) for view in views]
-    for view, picture, (file, arrays) in zip(views, paths, cameras, strict=True):
+    paths = [path_inside(folder, f"render_{view}.png", folder) for view in views]
+    for view, image, (file, arrays) in zip(views, paths, cameras, strict=True):
         for name, shape in (("K", (3, 3)), ("extrinsic", (4, 4))):
             if name not in arrays or arrays[name].shape != shape:
                 has = arrays[name].shape if name in arrays else "none"
@@ -139,8 +142,8 @@ def _scene(folder: Path, views: Sequence[int], cameras: Sequence[tuple[Path, Arr
         check_last_row(extrinsic, file, "extrinsic")
         K.append(intrinsics)
         E.append(extrinsic)
-        sizes.append(image_size(picture))
-        depth = child(folder, f"depth_{view}.png", folder)
+        sizes.append(image_size(image))
+        depth = path_inside(folder, f"depth_{view}.png", folder)
         depths.append(DepthPng(depth, DEPTH_STEP, (NO_DEPTH,)) if depth.exists() else None)
     poses = np.array(E)
     return assemble(
@@ -151,7 +154,7 @@ def _scene(folder: Path, views: Sequence[int], cameras: Sequence[tuple[Path, Arr
         file=folder,
         depths=depths,
         cut_out=True,
-        category=spell_synset(folder.resolve().parent.name),
+        category=synset_category(folder.resolve().parent.name),
     )
 
 

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lsmgeo.data.files import child, one_file, parse_floats, parse_ints, plain_files, read_text, refuse_unreadable
 from lsmgeo.data.formats.depth_files import DepthFile, read_pfm
+from lsmgeo.data.formats.scene_assembly import assemble, check_camera, check_image_size, check_intrinsics, make_cameras
 from lsmgeo.data.images import image_size
-from lsmgeo.data.posed import assemble, check_camera, check_intrinsics, check_picture, make_cameras
+from lsmgeo.data.read_files import file_reader, one_file, parse_floats, parse_ints, path_inside, plain_files, read_text
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
-    from lsmgeo.data.posed import PosedImages
+    from lsmgeo.data.posed_images import PosedImages
 
 __all__ = ["Disparity", "is_middlebury", "is_stereo_pair", "read_middlebury", "read_stereo_pair"]
 
@@ -37,11 +37,11 @@ def is_middlebury(path: Path) -> bool:
     return path.match(PARAMETERS) if path.is_file() else bool(plain_files(path, PARAMETERS))
 
 
-@refuse_unreadable
+@file_reader
 def read_middlebury(path: str | Path) -> PosedImages:
     """Read a Middlebury multi-view scene.
 
-    The file's first line counts the photographs; every other line is ``name K (9) R (9) t (3)`` with the projection
+    The file's first line counts the images; every other line is ``name K (9) R (9) t (3)`` with the projection
     ``K [R | t]``. (Seitz, Curless, Diebel, Scharstein, Szeliski, "A comparison and evaluation of multi-view stereo
     reconstruction algorithms", CVPR 2006.)
 
@@ -52,7 +52,7 @@ def read_middlebury(path: str | Path) -> PosedImages:
         path: the scene's folder, or its ``*_par.txt``.
 
     Returns:
-        The photographs with their cameras, no sparse points.
+        The images with their cameras, no sparse points.
 
     Raises:
         DataError: a file is missing, damaged, too large, names a file outside the folder, or holds no camera.
@@ -60,10 +60,10 @@ def read_middlebury(path: str | Path) -> PosedImages:
     file = one_file(Path(path), PARAMETERS)
     lines = [line.split() for line in read_text(file, MAX_PARAMETER_BYTES).splitlines() if line.strip()]
     if not lines or len(lines[0]) != 1:
-        raise DataError(file, "the first line must be the number of photographs")
+        raise DataError(file, "the first line must be the number of images")
     (count,) = parse_ints(lines[0], file, "line 1")
     if count != len(lines) - 1 or count < 1:
-        raise DataError(file, f"announces {count} photographs and holds {len(lines) - 1} lines of cameras")
+        raise DataError(file, f"announces {count} images and holds {len(lines) - 1} lines of cameras")
 
     names, paths, sizes = [], [], []
     numbers = np.zeros((count, 21))
@@ -74,8 +74,8 @@ def read_middlebury(path: str | Path) -> PosedImages:
         numbers[view] = parse_floats(tokens[1:], file, where)
         check_camera(numbers[view, :9].reshape(3, 3), numbers[view, 9:18].reshape(3, 3), file, where)
         names.append(tokens[0])
-        paths.append(child(file.parent, tokens[0], file))
-        # The format does not state the size, so it comes from the picture's own header.
+        paths.append(path_inside(file.parent, tokens[0], file))
+        # The format does not state the size, so it comes from the image's own header.
         sizes.append(image_size(paths[-1]))
     K, R, t = np.split(numbers, (9, 18), -1)
     cameras = make_cameras(K.reshape(-1, 3, 3), R.reshape(-1, 3, 3), t, sizes, file)
@@ -115,12 +115,12 @@ def is_stereo_pair(path: Path) -> bool:
     return (path / "calib.txt").is_file() and (path / "im0.png").is_file()
 
 
-@refuse_unreadable
+@file_reader
 def read_stereo_pair(path: str | Path) -> PosedImages:
     """Read a stereo pair of the Middlebury sets of 2014 and 2021.
 
     ``calib.txt`` holds ``cam0=[f 0 cx; 0 f cy; 0 0 1]``, ``cam1``, ``doffs``, ``baseline``, ``width``, ``height`` and
-    more; ``im0.png`` and ``im1.png`` are the left and the right photograph, ``disp0.pfm`` and ``disp1.pfm`` their
+    more; ``im0.png`` and ``im1.png`` are the left and the right image, ``disp0.pfm`` and ``disp1.pfm`` their
     disparities. (Scharstein et al., "High-resolution stereo datasets with subpixel-accurate ground truth", GCPR 2014.)
 
     Equation: a left pixel (x, y) with disparity d is the right pixel (x - d, y), and Z = f B / (d + doffs).
@@ -133,7 +133,7 @@ def read_stereo_pair(path: str | Path) -> PosedImages:
         path: the folder, or its ``calib.txt``.
 
     Returns:
-        The left photograph, then the right one, with cameras and what depth there is; no sparse points.
+        The left image, then the right one, with cameras and what depth there is; no sparse points.
 
     Raises:
         DataError: a file is missing, damaged or too large, leads outside the folder, or the two cameras are no
@@ -156,16 +156,16 @@ def read_stereo_pair(path: str | Path) -> PosedImages:
         raise DataError(file, "cam0 and cam1 must share focal length and cy: this is no rectified pair")
     if abs(second[0, 2] - first[0, 2] - offset) > ROUNDING:
         raise DataError(file, f"doffs is {offset:g}, but cx of cam1 less that of cam0 {second[0, 2] - first[0, 2]:g}")
-    paths = tuple(child(folder, name, file) for name in ("im0.png", "im1.png"))
-    sizes = [image_size(picture) for picture in paths]
+    paths = tuple(path_inside(folder, name, file) for name in ("im0.png", "im1.png"))
+    sizes = [image_size(image) for image in paths]
     if "height" in entries and "width" in entries:
         stated = tuple(parse_ints([entries["height"], entries["width"]], file, "height and width"))
-        for picture, size in zip(paths, sizes, strict=True):
-            check_picture((stated[0], stated[1]), size, picture, file, "width and height")
+        for image, size in zip(paths, sizes, strict=True):
+            check_image_size((stated[0], stated[1]), size, image, file, "width and height")
     cameras = make_cameras((first, second), [np.eye(3)] * 2, np.array([[0.0] * 3, [-baseline, 0.0, 0.0]]), sizes, file)
     depths = []
     for names in DISPARITIES:
-        here = [child(folder, name, file) for name in names if (folder / name).exists()]
+        here = [path_inside(folder, name, file) for name in names if (folder / name).exists()]
         depths.append(Disparity(here[0], focal_length, baseline, offset) if here else None)
     return assemble(("im0.png", "im1.png"), paths, cameras, "middlebury-stereo", file=file, depths=depths)
 

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lsmgeo.data.files import child, parse_floats, read_text, refuse_unreadable
 from lsmgeo.data.formats.format_binvox import read_binvox
+from lsmgeo.data.formats.scene_assembly import assemble, make_cameras
+from lsmgeo.data.formats.synsets import synset_category
 from lsmgeo.data.images import image_size
-from lsmgeo.data.posed import PosedImages, assemble, make_cameras
-from lsmgeo.data.shards.shape_sources import spell_synset
-from lsmgeo.data.shards.shard_metadata import MAX_VIEWS
+from lsmgeo.data.posed_images import PosedImages
+from lsmgeo.data.read_files import file_reader, parse_floats, path_inside, read_text
+from lsmgeo.data.sample import MAX_VIEWS
 from lsmgeo.errors import DataError
 
 __all__ = ["METADATA", "is_r2n2", "read_r2n2"]
@@ -31,11 +32,11 @@ def is_r2n2(path: Path) -> bool:
     return any((folder / METADATA).is_file() for folder in (path, path / "rendering"))
 
 
-@refuse_unreadable
+@file_reader
 def read_r2n2(path: str | Path) -> PosedImages:
     """Read the renderings of one object as 3D-R2N2 published them.
 
-    ``ShapeNetRendering/SYNSET/MODEL/rendering`` holds the pictures and, a line a view, azimuth, elevation, in-plane
+    ``ShapeNetRendering/SYNSET/MODEL/rendering`` holds the images and, a line a view, azimuth, elevation, in-plane
     rotation (degrees), distance and field of view; ``ShapeNetVox32/SYNSET/MODEL/model.binvox`` the voxels, which may
     also lie beside ``rendering``. (Choy, Xu, Gwak, Chen, Savarese, "3D-R2N2", ECCV 2016, and its renderer.)
 
@@ -65,8 +66,8 @@ def read_r2n2(path: str | Path) -> PosedImages:
     if np.abs(numbers[:, :3]).max() > 1e4 or not ((numbers[:, 3] > 1e-3) & (numbers[:, 3] < 1e3)).all():
         raise DataError(file, "holds an angle beyond 10000 degrees, or a distance that is none")
     names = _names(folder, len(lines))
-    paths = [child(folder, name, folder / NAMES) for name in names]
-    sizes = [image_size(picture) for picture in paths]
+    paths = [path_inside(folder, name, folder / NAMES) for name in names]
+    sizes = [image_size(image) for image in paths]
     height, width = np.array(sizes).T
     K = np.zeros((len(lines), 3, 3))
     K[:, 0, 0] = K[:, 1, 1] = FOCAL_LENGTH_OF_WIDTH * width
@@ -82,7 +83,7 @@ def read_r2n2(path: str | Path) -> PosedImages:
         file=file,
         voxels=None if solid is None else read_binvox(solid, placement="centred"),
         cut_out=True,
-        category=spell_synset(home.parent.name),
+        category=synset_category(home.parent.name),
     )
 
 
@@ -91,7 +92,7 @@ def _names(folder: Path, count: int) -> list[str]:
         return [f"{view:02d}.png" for view in range(count)]
     names = read_text(folder / NAMES, MAX_BYTES).split()
     if len(names) != count or len(set(names)) != count:
-        raise DataError(folder / NAMES, f"must name {count} different pictures, as {METADATA} has lines")
+        raise DataError(folder / NAMES, f"must name {count} different images, as {METADATA} has lines")
     return names
 
 
@@ -113,9 +114,9 @@ def _solid(home: Path) -> Path | None:
     """The voxels of the object, beside its renderings or in the tree that was published beside theirs."""
     beside = home / "model.binvox"
     if beside.is_file():
-        return child(home, beside.name, home)
+        return path_inside(home, beside.name, home)
     if len(home.parents) < 3:
         return None
     root = home.parents[2]
     apart = root / "ShapeNetVox32" / home.parent.name / home.name / "model.binvox"
-    return child(root, str(apart.relative_to(root)), home) if apart.is_file() else None
+    return path_inside(root, str(apart.relative_to(root)), home) if apart.is_file() else None

@@ -1,4 +1,4 @@
-"""Strecha's multi-view scenes: a ``.camera`` file beside every photograph."""
+"""Strecha's multi-view scenes: a ``.camera`` file beside every image."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lsmgeo.data.files import child, parse_floats, plain_files, read_text, refuse_unreadable
+from lsmgeo.data.formats.scene_assembly import assemble, check_camera, check_image_size, make_cameras
 from lsmgeo.data.images import image_size
-from lsmgeo.data.posed import PosedImages, assemble, check_camera, check_picture, make_cameras
+from lsmgeo.data.posed_images import PosedImages
+from lsmgeo.data.read_files import file_reader, parse_floats, path_inside, plain_files, read_text
 from lsmgeo.errors import DataError
 
 __all__ = ["is_strecha", "read_strecha"]
@@ -26,14 +27,14 @@ def is_strecha(path: Path) -> bool:
     return bool(plain_files(path, *PATTERNS)) if path.is_dir() else path.suffix == SUFFIX
 
 
-@refuse_unreadable
+@file_reader
 def read_strecha(path: str | Path) -> PosedImages:
     """Read a scene in the form of Strecha's multi-view benchmark.
 
     ``0000.png.camera`` belongs to ``0000.png`` and holds K (3 lines), three numbers of radial distortion, R (3 lines),
     the camera's centre C, then width and height; the projection is ``K [R^T | -R^T C]``. (Strecha, von Hansen, Van
     Gool, Fua, Thoennessen, "On benchmarking camera calibration and multi-view stereo for high resolution imagery", CVPR
-    2008.) The photographs lie beside these files, in ``images`` there, or in ``images`` beside their folder; ``.P``
+    2008.) The images lie beside these files, in ``images`` there, or in ``images`` beside their folder; ``.P``
     and ``.bounding`` files are not read.
 
     Convention:
@@ -43,11 +44,11 @@ def read_strecha(path: str | Path) -> PosedImages:
         path: the folder of the ``.camera`` files, or the one above it; or one of these files, for all of its folder.
 
     Returns:
-        The photographs with their cameras, ordered by name; no sparse points.
+        The images with their cameras, ordered by name; no sparse points.
 
     Raises:
         DataError: a file is missing, damaged or too large, several folders hold such files, a camera has distortion,
-            makes no sense, or is of another size than its photograph.
+            makes no sense, or is of another size than its image.
     """
     path = Path(path)
     files = plain_files(path if path.is_dir() else path.parent, *PATTERNS)
@@ -70,19 +71,19 @@ def read_strecha(path: str | Path) -> PosedImages:
         if np.abs(center).max() > 1e12:
             raise DataError(file, "the camera's centre lies beyond 1e12")
         names.append(file.name.removesuffix(SUFFIX))
-        paths.append(_picture(file, names[-1]))
+        paths.append(_image(file, names[-1]))
         sizes.append(image_size(paths[-1]))
-        check_picture((height, width), sizes[-1], paths[-1], file, "camera")
+        check_image_size((height, width), sizes[-1], paths[-1], file, "camera")
         rotations.append(rotation.reshape(3, 3).T)
         translations.append(-rotations[-1] @ center)
     cameras = make_cameras(intrinsics, rotations, translations, sizes, folders[0])
     return assemble(names, paths, cameras, "strecha", file=folders[0])
 
 
-def _picture(file: Path, name: str) -> Path:
+def _image(file: Path, name: str) -> Path:
     for root in (file.parent, file.parent / "images", file.parent.parent / "images"):
         if root.is_dir():
-            picture = child(root, name, file)
-            if picture.is_file():
-                return picture
-    raise DataError(file, f"finds no picture {name[:80]!r} beside it, in images, nor in ../images")
+            image = path_inside(root, name, file)
+            if image.is_file():
+                return image
+    raise DataError(file, f"finds no image {name[:80]!r} beside it, in images, nor in ../images")

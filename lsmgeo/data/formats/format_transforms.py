@@ -12,21 +12,21 @@ import torch
 
 from lsmgeo._checks import describe
 from lsmgeo.cameras import from_opengl
-from lsmgeo.data.files import child, one_file, plain_files, refuse_unreadable
 from lsmgeo.data.formats.depth_files import DepthFile, DepthPng
 from lsmgeo.data.formats.lenses import Lens
-from lsmgeo.data.images import SUFFIXES, has_alpha, image_size
-from lsmgeo.data.json_files import peek_json, read_json, take_array, take_number, take_text
-from lsmgeo.data.posed import (
+from lsmgeo.data.formats.scene_assembly import (
     MAX_PARAMETER,
     MAX_SIDE,
-    PosedImages,
-    as_data_error,
     assemble,
+    camera_errors_as_data_errors,
+    check_image_size,
     check_last_row,
-    check_picture,
     check_rotation,
 )
+from lsmgeo.data.images import SUFFIXES, has_alpha, image_size
+from lsmgeo.data.json_files import read_array, read_json, read_number, read_string, sniff_json
+from lsmgeo.data.posed_images import PosedImages
+from lsmgeo.data.read_files import file_reader, one_file, path_inside, plain_files
 from lsmgeo.errors import DataError
 
 __all__ = ["is_transforms", "read_transforms"]
@@ -50,35 +50,35 @@ def is_transforms(path: Path) -> bool:
     """Whether a folder holds such files, or a JSON file such frames."""
     if path.is_dir():
         return bool(plain_files(path, *NAMES))
-    return path.suffix.lower() == ".json" and isinstance(peek_json(path).get("frames"), list)
+    return path.suffix.lower() == ".json" and isinstance(sniff_json(path).get("frames"), list)
 
 
-@refuse_unreadable
+@file_reader
 def read_transforms(path: str | Path) -> PosedImages:
     """Read a ``transforms.json`` of NeRF's Blender scenes, of instant-ngp or of nerfstudio.
 
     A frame's ``transform_matrix`` is camera-to-world, 4 x 4 or its first three rows. The camera is stated by ``fl_x``,
-    ``fl_y``, ``cx``, ``cy``, ``w``, ``h`` or by ``camera_angle_x`` (radians, across the picture), and its distortion by
+    ``fl_y``, ``cx``, ``cy``, ``w``, ``h`` or by ``camera_angle_x`` (radians, across the image), and its distortion by
     ``k1``, ``k2``, ``p1``, ``p2``, ``k3`` or, for a fisheye, by ``k1`` to ``k4``; once for all, or in a frame. (Format:
     Mildenhall et al., "NeRF", ECCV 2020, and the documentation of instant-ngp and nerfstudio.)
 
     Convention:
         OpenGL axes (x right, y up, z backwards) become OpenCV's, and camera-to-world world-to-camera. Pixel centres
-        are half-integer: principal points lose 0.5. What the file leaves out is the picture's size and its middle.
+        are half-integer: principal points lose 0.5. What the file leaves out is the image's size and its middle.
         A rotation with a scale in it is refused, not divided by it. ``depth_file_path`` is a 16-bit PNG in
         millimetres unless ``depth_unit_scale_factor`` says otherwise, camera z; where it has fewer or more pixels than
-        its photograph, and is of the same shape, its nearest pixels are taken. Masks are not read.
+        its image, and is of the same shape, its nearest pixels are taken. Masks are not read.
 
     Args:
         path: the file, or a folder with ``transforms.json`` or with one ``transforms_*.json``.
 
     Returns:
-        The photographs with their cameras, cut out where any of them has alpha, straightened where they have
+        The images with their cameras, cut out where any of them has alpha, straightened where they have
         distortion; no sparse points.
 
     Raises:
         DataError: a file is missing, damaged or too large, names a file outside its folder, states a camera that makes
-            no sense or is of another size than its picture, or the folder holds several files.
+            no sense or is of another size than its image, or the folder holds several files.
     """
     file = one_file(Path(path), *NAMES)
     values = read_json(file)
@@ -95,12 +95,12 @@ def read_transforms(path: str | Path) -> PosedImages:
         where = f"frame {index}"
         if not isinstance(frame, dict):
             raise DataError(file, f"{where}: expected an object; got {describe(frame)}")
-        names.append(_take_name(frame, "file_path", file, where))
-        paths.append(_picture(file, names[-1]))
+        names.append(_read_name(frame, "file_path", file, where))
+        paths.append(_image(file, names[-1]))
         size = image_size(paths[-1])
         cut_out = cut_out or has_alpha(paths[-1])
-        stated = _Stated(file, where, values, frame)
-        check_picture(stated.size(size), size, paths[-1], file, where)
+        stated = _FrameCamera(file, where, values, frame)
+        check_image_size(stated.size(size), size, paths[-1], file, where)
         sizes.append(size)
         intrinsics.append(stated.intrinsics(size))
         poses.append(_pose(frame, file, where))
@@ -110,39 +110,39 @@ def read_transforms(path: str | Path) -> PosedImages:
         lenses.append(None if lens is None or key is None else made.setdefault(key, lens))
         depths.append(stated.depth())
     height, width = torch.tensor(sizes).unbind(-1)
-    with as_data_error(file):
+    with camera_errors_as_data_errors(file):
         cameras = from_opengl(torch.from_numpy(np.stack(intrinsics)), torch.from_numpy(np.stack(poses)), height, width)
     return assemble(names, paths, cameras, "transforms", file=file, lenses=lenses, depths=depths, cut_out=cut_out)
 
 
-def _take_name(frame: dict[str, Any], key: str, file: Path, where: str) -> str:
+def _read_name(frame: dict[str, Any], key: str, file: Path, where: str) -> str:
     # Files made on Windows have backslashes between folders.
-    return take_text(frame, key, file, where).replace("\\", "/")
+    return read_string(frame, key, file, where).replace("\\", "/")
 
 
-def _picture(file: Path, name: str) -> Path:
-    """The picture of a frame, whose name may lack what it ends with."""
-    path = child(file.parent, name, file)
+def _image(file: Path, name: str) -> Path:
+    """The image of a frame, whose name may lack what it ends with."""
+    path = path_inside(file.parent, name, file)
     if path.is_file():
         return path
     for suffix in (*SUFFIXES, *(suffix.upper() for suffix in SUFFIXES)):
-        longer = child(file.parent, name + suffix, file)
+        longer = path_inside(file.parent, name + suffix, file)
         if longer.is_file():
             return longer
-    raise DataError(path, "no such picture, nor one with .png, .jpg or .jpeg after it")
+    raise DataError(path, "no such image, nor one with .png, .jpg or .jpeg after it")
 
 
 def _pose(frame: dict[str, Any], file: Path, where: str) -> np.ndarray:
     rows = frame.get("transform_matrix")
     short = isinstance(rows, list) and len(rows) == 3
     pose = np.eye(4)
-    pose[: 3 if short else 4] = take_array(frame, "transform_matrix", (3 if short else 4, 4), file, where)
+    pose[: 3 if short else 4] = read_array(frame, "transform_matrix", (3 if short else 4, 4), file, where)
     check_last_row(pose, file, f"{where}: transform_matrix")
     check_rotation(pose[:3, :3], file, where)
     return pose
 
 
-class _Stated:
+class _FrameCamera:
     """What a file says of one frame's camera: in the frame itself, else for all."""
 
     def __init__(self, file: Path, where: str, values: dict[str, Any], frame: dict[str, Any]):
@@ -155,12 +155,12 @@ class _Stated:
         """A number, or the default where there is none."""
         if default is not None and key not in self.all:
             return default
-        return take_number(self.all, key, self.file, self.where, beyond=beyond)
+        return read_number(self.all, key, self.file, self.where, beyond=beyond)
 
-    def size(self, picture: tuple[int, int]) -> tuple[int, int]:
-        """(height, width), the picture's where the file says nothing."""
+    def size(self, image: tuple[int, int]) -> tuple[int, int]:
+        """(height, width), the image's where the file says nothing."""
         sides = []
-        for key, side in zip(("h", "w"), picture, strict=True):
+        for key, side in zip(("h", "w"), image, strict=True):
             stated = self.number(key, side)
             if not 1 <= stated <= MAX_SIDE or stated != round(stated):
                 raise DataError(self.file, f"{self.where}: {key} must be a whole number of pixels; got {stated:g}")
@@ -182,9 +182,9 @@ class _Stated:
         # What a frame says of its lens goes before what is said for all, in whichever words.
         scope = self.frame if length in self.frame or across in self.frame else self.all
         if length in scope:
-            focal = take_number(scope, length, self.file, self.where, beyond=MAX_PARAMETER)
+            focal = read_number(scope, length, self.file, self.where, beyond=MAX_PARAMETER)
         elif across in scope:
-            angle = take_number(scope, across, self.file, self.where)
+            angle = read_number(scope, across, self.file, self.where)
             if not 1e-6 < angle < math.pi:
                 reason = f"{across} must lie between 0 and pi (radians); got {angle:g}"
                 raise DataError(self.file, f"{self.where}: {reason}")
@@ -222,9 +222,9 @@ class _Stated:
         """The depth of the frame."""
         if "depth_file_path" not in self.frame:
             return None
-        name = _take_name(self.frame, "depth_file_path", self.file, self.where)
+        name = _read_name(self.frame, "depth_file_path", self.file, self.where)
         step = self.number("depth_unit_scale_factor", DEPTH_STEP)
         if not step > 0:
             raise DataError(self.file, f"{self.where}: depth_unit_scale_factor must be positive; got {step:g}")
-        # Exports of telephones have depth of fewer pixels than their photographs.
-        return DepthPng(child(self.file.parent, name, self.file), step, any_size=True)
+        # Exports of telephones have depth of fewer pixels than their images.
+        return DepthPng(path_inside(self.file.parent, name, self.file), step, any_size=True)

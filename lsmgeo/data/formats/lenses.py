@@ -1,4 +1,4 @@
-"""Lenses that bend straight lines, and the straight photographs that OpenCV makes of what they saw."""
+"""Lenses that bend straight lines, and the straight images that OpenCV makes of what they saw."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Lens"]
 MOST_ZOOM = 20.0
 # OpenCV's remap counts pixels along a side in 16 bits.
 MAX_SIDE = (1 << 15) - 2
-# Points along each side of a photograph at which its view is measured, and pixels by which these may miss.
+# Points along each side of an image at which its view is measured, and pixels by which these may miss.
 RIM_STEPS = 65
 RIM_SLACK = 0.01
 
@@ -33,9 +33,9 @@ class Lens:
 
     Attributes:
         kind: "perspective" or "fisheye".
-        intrinsics: (3, 3) float64 of the photograph as it was taken, no skew.
+        intrinsics: (3, 3) float64 of the image as it was taken, no skew.
         coefficients: 4, 5, 8, 12 or 14 numbers for "perspective", 4 for "fisheye".
-        height: rows of the photograph, and of the straightened one.
+        height: rows of the image, and of the straightened one.
         width: columns.
     """
 
@@ -47,16 +47,16 @@ class Lens:
 
     @cached_property
     def pinhole(self) -> np.ndarray:
-        """K of the straightened photograph, (3, 3): as wide a view as has no empty pixel, at the same size.
+        """K of the straightened image, (3, 3): as wide a view as has no empty pixel, at the same size.
 
         Raises:
-            CameraError: the coefficients straighten nothing: no such view exists; or the photograph is too long for
+            CameraError: the coefficients straighten nothing: no such view exists; or the image is too long for
                 OpenCV.
         """
         if max(self.height, self.width) > MAX_SIDE:
             size = f"{self.width} x {self.height}"
-            raise CameraError(f"Lens: photographs of at most {MAX_SIDE} pixels a side are straightened; got {size}")
-        rims = [self._rays(rim) for rim in self._rims()]
+            raise CameraError(f"Lens: images of at most {MAX_SIDE} pixels a side are straightened; got {size}")
+        rims = [self._rays(rim) for rim in self._borders()]
         # A ray that the model cannot trace back (NaN) may lie in a corner that the view need not reach.
         if any(np.isnan(rim[:, 0]).all() for rim in rims):
             raise CameraError(f"Lens: the distortion {self.coefficients} cannot be undone")
@@ -69,32 +69,32 @@ class Lens:
         zoom = K[[0, 1], [0, 1]] / self.intrinsics[[0, 1], [0, 1]]
         if not ((zoom > 1 / MOST_ZOOM).all() and (zoom < MOST_ZOOM).all() and self._covers(K)):
             size = f"{self.width} x {self.height}"
-            raise CameraError(f"Lens: the distortion {self.coefficients} leaves no straight picture of {size} pixels")
+            raise CameraError(f"Lens: the distortion {self.coefficients} leaves no straight image of {size} pixels")
         return K
 
-    def _rims(self) -> list[np.ndarray]:
-        """Pixel centres (N, 2) along the left, right, top and bottom of a photograph."""
+    def _borders(self) -> list[np.ndarray]:
+        """Pixel centres (N, 2) along the left, right, top and bottom of an image."""
         x, y = np.linspace(0, self.width - 1, RIM_STEPS), np.linspace(0, self.height - 1, RIM_STEPS)
         sides = [(np.full_like(y, side), y) for side in (0, self.width - 1)]
         ends = [(x, np.full_like(x, end)) for end in (0, self.height - 1)]
         return [np.stack(rim, -1) for rim in (*sides, *ends)]
 
     def _covers(self, K: np.ndarray) -> bool:
-        """Whether the photograph shows all that a pinhole camera with this K sees, and there and back is the same."""
-        rim = np.concatenate(self._rims())
+        """Whether the image shows all that a pinhole camera with this K sees, and there and back is the same."""
+        rim = np.concatenate(self._borders())
         rays = np.linalg.solve(K, np.column_stack((rim, np.ones(len(rim)))).T).T[:, :2]
-        pixels = self._bend(rays)
+        pixels = self._distort(rays)
         inside = (pixels > -RIM_SLACK).all() and (
             pixels < (self.width - 1 + RIM_SLACK, self.height - 1 + RIM_SLACK)
         ).all()
         back = np.abs(self._rays(pixels) - rays) * K[[0, 1], [0, 1]]
         return bool(inside and (back < RIM_SLACK).all())
 
-    def straighten(self, picture: np.ndarray, *, nearest: bool = False) -> np.ndarray:
-        """The photograph that the pinhole camera would have taken.
+    def straighten(self, image: np.ndarray, *, nearest: bool = False) -> np.ndarray:
+        """The image that the pinhole camera would have taken.
 
         Args:
-            picture: (H, W) or (H, W, C), of this lens.
+            image: (H, W) or (H, W, C), of this lens.
             nearest: take the nearest pixel instead of mixing four: for depth, where a mean of two surfaces is neither.
 
         Returns:
@@ -103,8 +103,8 @@ class Lens:
         import cv2
 
         how = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
-        straight = cv2.remap(np.ascontiguousarray(picture), *self._maps, how)
-        return np.asarray(straight).reshape(picture.shape)
+        straight = cv2.remap(np.ascontiguousarray(image), *self._maps, how)
+        return np.asarray(straight).reshape(image.shape)
 
     def straighten_pixels(self, pixels: np.ndarray) -> np.ndarray:
         """Where the pinhole camera sees what this one sees at ``pixels``, (N, 2), x then y; NaN where it cannot."""
@@ -118,30 +118,30 @@ class Lens:
             return np.zeros((0, 2))
         points = np.ascontiguousarray(pixels, np.float64)[:, None]
         if self.kind == "fisheye":
-            straight = cv2.fisheye.undistortPoints(points, self.intrinsics, self._bent)
+            straight = cv2.fisheye.undistortPoints(points, self.intrinsics, self._distortion)
         else:
             # OpenCV's default of five rounds leaves pixels of error in the corners of a wide lens.
             rounds = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
-            straight = cv2.undistortPoints(points, self.intrinsics, self._bent, criteria=rounds)
+            straight = cv2.undistortPoints(points, self.intrinsics, self._distortion, criteria=rounds)
         rays = np.asarray(straight, np.float64).reshape(-1, 2)
         # Beyond what the model can undo, OpenCV gives numbers all the same.
         with np.errstate(invalid="ignore", over="ignore"):
-            missed = np.abs(self._bend(rays) - pixels).max(1)
+            missed = np.abs(self._distort(rays) - pixels).max(1)
         return np.where((missed < RIM_SLACK)[:, None], rays, np.nan)
 
-    def _bend(self, rays: np.ndarray) -> np.ndarray:
+    def _distort(self, rays: np.ndarray) -> np.ndarray:
         """Pixels (N, 2) at which this camera sees rays (N, 2)."""
         import cv2
 
         if self.kind == "fisheye":
-            bent = cv2.fisheye.distortPoints(np.ascontiguousarray(rays)[:, None], self.intrinsics, self._bent)
+            bent = cv2.fisheye.distortPoints(np.ascontiguousarray(rays)[:, None], self.intrinsics, self._distortion)
         else:
             points = np.column_stack((rays, np.ones(len(rays))))
-            bent, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.intrinsics, self._bent)
+            bent, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.intrinsics, self._distortion)
         return np.asarray(bent, np.float64).reshape(-1, 2)
 
     @cached_property
-    def _bent(self) -> np.ndarray:
+    def _distortion(self) -> np.ndarray:
         return np.array(self.coefficients, np.float64)
 
     @property
@@ -149,4 +149,6 @@ class Lens:
         import cv2
 
         initialise: Any = cv2.fisheye.initUndistortRectifyMap if self.kind == "fisheye" else cv2.initUndistortRectifyMap
-        return initialise(self.intrinsics, self._bent, np.eye(3), self.pinhole, (self.width, self.height), cv2.CV_32FC1)
+        return initialise(
+            self.intrinsics, self._distortion, np.eye(3), self.pinhole, (self.width, self.height), cv2.CV_32FC1
+        )

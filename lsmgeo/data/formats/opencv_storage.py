@@ -24,7 +24,7 @@ MOST_TEXT = 512
 
 
 def is_storage(path: Path) -> bool:
-    """Whether a file looks like one that FileStorage wrote: it holds its matrices, or, but for JSON, names pictures."""
+    """Whether a file looks like one that FileStorage wrote: it holds its matrices, or, but for JSON, names images."""
     if path.suffix.lower() not in SUFFIXES or not path.is_file():
         return False
     with path.open("rb") as stream:
@@ -86,7 +86,7 @@ def _matrix(node: Any) -> np.ndarray | None:
         rows, columns = _number(sizes.at(0)), _number(sizes.at(1)) if sizes.size() == 2 else 1.0
     elif sizes.isInt():  # the same as XML
         rows, columns = _number(sizes), 1.0
-    # Of several channels, as corners in pictures have, nothing is used.
+    # Of several channels, as corners in images have, nothing is used.
     if not data.isSeq() or data.size() > MOST_VALUES or rows <= 0 or rows * columns != data.size():
         return None
     # The numbers as they stand, not `node.mat()`: that one allocates what rows and columns ask for.

@@ -1,4 +1,4 @@
-"""Posed photographs as other programs want them: a COLMAP model, a ``transforms.json``, a plain JSON file."""
+"""Posed images as other programs want them: a COLMAP model, a ``transforms.json``, a plain JSON file."""
 
 from __future__ import annotations
 
@@ -7,37 +7,39 @@ import math
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from lsmgeo.cameras import to_colmap, to_opengl
-from lsmgeo.data.files import atomic_folder, child, read_bytes, write_atomic
-from lsmgeo.data.formats.format_cameras_json import NAME, state_camera, state_cameras
+from lsmgeo.data.atomic_files import atomic_folder, write_atomic
+from lsmgeo.data.formats.format_cameras_json import NAME, camera_entry, encode_cameras
+from lsmgeo.data.formats.scene_assembly import check_image_size
 from lsmgeo.data.images import MAX_IMAGE_BYTES, SUFFIXES, encode_png, image_size, read_cut_out, read_image
-from lsmgeo.data.posed import check_picture
+from lsmgeo.data.read_files import path_inside, read_bytes
 from lsmgeo.errors import DataError, OptionError
 
 if TYPE_CHECKING:
     from os import PathLike
 
     from lsmgeo.cameras import CameraTensors
-    from lsmgeo.data.posed import PosedImages
+    from lsmgeo.data.posed_images import PosedImages
 
-__all__ = ["write_cameras_json", "write_colmap", "write_transforms"]
+__all__ = ["write_cameras_json", "write_colmap", "write_point_cloud", "write_transforms"]
 
-PICTURES = "images"
+IMAGES = "images"
 
 
 def write_colmap(images: PosedImages, folder: str | PathLike[str]) -> Path:
-    """Write posed photographs as a COLMAP model in text form: ``sparse/0`` and ``images``.
+    """Write posed images as a COLMAP model in text form: ``sparse/0`` and ``images``.
 
     Convention:
         COLMAP's: world-to-camera quaternions, half-integer pixel centres (principal points and observations gain
-        0.5). All cameras are PINHOLE: photographs taken through a lens are written straightened, as PNG; all others
+        0.5). All cameras are PINHOLE: images taken through a lens are written straightened, as PNG; all others
         byte by byte. A rotation that is only nearly one is written as the nearest, about the same camera centre.
         Blanks in names become underscores, which COLMAP's text form cannot hold. Depth and voxels are not written.
 
     Args:
-        images: the photographs; their sparse points and observations are written too.
+        images: the images; their sparse points and observations are written too.
         folder: the folder to make, which must not exist or be empty; it is there whole or not at all.
 
     Returns:
@@ -45,40 +47,40 @@ def write_colmap(images: PosedImages, folder: str | PathLike[str]) -> Path:
 
     Raises:
         OptionError: a camera has skew, which COLMAP cannot hold.
-        DataError: the folder is there already or cannot be written, or a photograph cannot be read.
+        DataError: the folder is there already or cannot be written, or an image cannot be read.
     """
     _refuse_skew("write_colmap", "COLMAP", images)
     names = _file_names(images, blank="_")
     K, quaternions, translations = (part.numpy() for part in to_colmap(_as_rigid(images.cameras)))
     models: dict[str, int] = {}
-    pictures = []
+    lines = []
     for view in range(len(images)):
         height, width = images.size(view)
         matrix = K[view]
         numbers = _joined(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
         camera = models.setdefault(f"PINHOLE {width} {height} {numbers}", len(models) + 1)
         pose = _joined(*quaternions[view], *translations[view])
-        pictures += [f"{view + 1} {pose} {camera} {names[view]}", _observed(images, view)]
+        lines += [f"{view + 1} {pose} {camera} {names[view]}", _observed(images, view)]
     cameras = [f"{camera} {model}" for model, camera in models.items()]
     points = _points(images)
     with atomic_folder(folder) as made:
-        _write_pictures(images, names, made / PICTURES)
-        for name, rows in (("cameras", cameras), ("images", pictures), ("points3D", points)):
+        _write_images(images, names, made / IMAGES)
+        for name, rows in (("cameras", cameras), ("images", lines), ("points3D", points)):
             write_atomic(made / "sparse" / "0" / f"{name}.txt", "".join(f"{row}\n" for row in rows).encode())
     return Path(folder)
 
 
 def write_transforms(images: PosedImages, folder: str | PathLike[str]) -> Path:
-    """Write posed photographs as ``transforms.json`` and ``images``, as instant-ngp and nerfstudio read them.
+    """Write posed images as ``transforms.json`` and ``images``, as instant-ngp and nerfstudio read them.
 
     Convention:
         Camera-to-world, OpenGL axes, half-integer pixel centres (principal points gain 0.5); no distortion:
-        photographs taken through a lens are written straightened, as PNG; all others byte by byte. A rotation that is
+        images taken through a lens are written straightened, as PNG; all others byte by byte. A rotation that is
         only nearly one is written as the nearest, about the same camera centre. Points, depth and voxels are not
         written.
 
     Args:
-        images: the photographs.
+        images: the images.
         folder: the folder to make, which must not exist or be empty; it is there whole or not at all.
 
     Returns:
@@ -86,7 +88,7 @@ def write_transforms(images: PosedImages, folder: str | PathLike[str]) -> Path:
 
     Raises:
         OptionError: a camera has skew, which the format cannot hold.
-        DataError: the folder is there already or cannot be written, or a photograph cannot be read.
+        DataError: the folder is there already or cannot be written, or an image cannot be read.
     """
     _refuse_skew("write_transforms", "transforms.json", images)
     names = _file_names(images)
@@ -98,7 +100,7 @@ def write_transforms(images: PosedImages, folder: str | PathLike[str]) -> Path:
         angles = (2 * math.atan(0.5 * side / focal) for side, focal in ((width, fx), (height, fy)))
         keys = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
         stated.append(dict(zip(keys, (width, height, fx, fy, cx, cy, *angles), strict=True)))
-        frames.append({"file_path": f"{PICTURES}/{name}", "transform_matrix": poses[view].tolist()})
+        frames.append({"file_path": f"{IMAGES}/{name}", "transform_matrix": poses[view].tolist()})
     values: dict[str, Any] = {"camera_model": "PINHOLE"}
     if all(camera == stated[0] for camera in stated):
         values |= stated[0]
@@ -106,65 +108,65 @@ def write_transforms(images: PosedImages, folder: str | PathLike[str]) -> Path:
         frames = [camera | frame for camera, frame in zip(stated, frames, strict=True)]
     values["frames"] = frames
     with atomic_folder(folder) as made:
-        _write_pictures(images, names, made / PICTURES)
+        _write_images(images, names, made / IMAGES)
         write_atomic(made / "transforms.json", json.dumps(values, indent=1, allow_nan=False).encode())
     return Path(folder)
 
 
 def write_cameras_json(images: PosedImages, path: str | PathLike[str]) -> Path:
-    """Write posed photographs as a plain JSON file of cameras, which `read_cameras_json` describes.
+    """Write posed images as a plain JSON file of cameras, which `read_cameras_json` describes.
 
     Convention:
         Ours: world-to-camera, OpenCV axes, integer pixel centres, K with its skew. Nothing is rounded. Points, depth
         and voxels are not written.
 
     Args:
-        images: the photographs.
+        images: the images.
         path: a folder to make, which must not exist or be empty, for ``cameras.json`` and ``images``; or a file that
-            ends in ``.json``, in a folder that has all the photographs in or below it, for the cameras alone, where it
+            ends in ``.json``, in a folder that has all the images in or below it, for the cameras alone, where it
             replaces one that is there.
 
     Returns:
         The path.
 
     Raises:
-        OptionError: cameras alone are asked for, and a photograph lies elsewhere or was taken through a lens.
-        DataError: the folder is there already, something cannot be written, or a photograph cannot be read.
+        OptionError: cameras alone are asked for, and an image lies elsewhere or was taken through a lens.
+        DataError: the folder is there already, something cannot be written, or an image cannot be read.
     """
     path = Path(path)
     alone = path.suffix.lower() == ".json"
-    names = _below(images, path.parent) if alone else [f"{PICTURES}/{name}" for name in _file_names(images)]
-    cameras = [{"file": name} | state_camera(images.camera(view)) for view, name in enumerate(names)]
+    names = _below(images, path.parent) if alone else [f"{IMAGES}/{name}" for name in _file_names(images)]
+    cameras = [{"file": name} | camera_entry(images.camera(view)) for view, name in enumerate(names)]
     if alone:
-        return write_atomic(path, state_cameras(cameras))
+        return write_atomic(path, encode_cameras(cameras))
     with atomic_folder(path) as made:
-        _write_pictures(images, names, made)
-        write_atomic(made / NAME, state_cameras(cameras))
+        _write_images(images, names, made)
+        write_atomic(made / NAME, encode_cameras(cameras))
     return path
 
 
 def _below(images: PosedImages, folder: Path) -> list[str]:
-    """The photographs' paths relative to the folder."""
+    """The images' paths relative to the folder."""
     if images.lenses is not None:
         raise OptionError(
-            "write_cameras_json: path must be a folder for photographs taken through a lens, which are written "
+            "write_cameras_json: path must be a folder for images taken through a lens, which are written "
             "straightened; got a file"
         )
     names = []
     for path in images.paths:
         if not path.resolve().is_relative_to(folder.resolve()):
-            raise OptionError(f"write_cameras_json: photographs must lie below the folder of the file; got {path}")
+            raise OptionError(f"write_cameras_json: images must lie below the folder of the file; got {path}")
         names.append(path.resolve().relative_to(folder.resolve()).as_posix())
     return names
 
 
 def _file_names(images: PosedImages, *, blank: str = " ") -> list[str]:
-    """What the photographs are called below ``images``: as their source does, with what their files end with."""
+    """What the images are called below ``images``: as their source does, with what their files end with."""
     names = []
     for view, name in enumerate(images.names):
         parts = [part for part in PurePosixPath(name).parts if part not in ("..", "/")]
         # A scene that was written here comes back with images/ before every name.
-        plain = PurePosixPath(*(parts[1:] if len(parts) > 1 and parts[0] == PICTURES else parts))
+        plain = PurePosixPath(*(parts[1:] if len(parts) > 1 and parts[0] == IMAGES else parts))
         suffix = images.paths[view].suffix
         bent = images.lenses is not None and images.lenses[view] is not None
         if plain.suffix.lower() not in SUFFIXES:
@@ -172,14 +174,14 @@ def _file_names(images: PosedImages, *, blank: str = " ") -> list[str]:
         names.append(str(plain.with_suffix(".png") if bent else plain).replace(" ", blank))
     twice = next((name for name in names if names.count(name) > 1), None) if len(set(names)) < len(names) else None
     if twice is not None:
-        raise DataError(images.paths[names.index(twice)], f"is one of two photographs that would be called {twice!r}")
+        raise DataError(images.paths[names.index(twice)], f"is one of two images that would be called {twice!r}")
     return names
 
 
-def _write_pictures(images: PosedImages, names: list[str], folder: Path) -> None:
+def _write_images(images: PosedImages, names: list[str], folder: Path) -> None:
     for view, name in enumerate(names):
         source, size = images.paths[view], images.size(view)
-        check_picture(size, image_size(source), source, source, name)
+        check_image_size(size, image_size(source), source, source, name)
         lens = None if images.lenses is None else images.lenses[view]
         if lens is None:
             content = read_bytes(source, MAX_IMAGE_BYTES)
@@ -187,7 +189,7 @@ def _write_pictures(images: PosedImages, names: list[str], folder: Path) -> None
             pixels = read_cut_out(source, size) if images.cut_out else read_image(source, size)
             content = encode_png(lens.straighten(pixels))
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(child(folder, name, source), content)
+        write_atomic(path_inside(folder, name, source), content)
 
 
 def _refuse_skew(who: str, what: str, images: PosedImages) -> None:
@@ -239,3 +241,31 @@ def _points(images: PosedImages) -> list[str]:
         " ".join([str(index), _joined(*position), *map(str, colour), "-1", *track])
         for index, (position, colour, track) in enumerate(rows, 1)
     ]
+
+
+def write_point_cloud(path: str | PathLike[str], positions: np.ndarray, colours: np.ndarray) -> Path:
+    """Write coloured points as a binary PLY file, atomically.
+
+    Args:
+        path: the file to write.
+        positions: (N, 3) world coordinates, N >= 1.
+        colours: (N, 3) uint8 RGB.
+
+    Returns:
+        The path written.
+
+    Raises:
+        DataError: there is no point, shapes do not agree, a position is not finite, or the file cannot be written.
+    """
+    positions = np.asarray(positions)
+    colours = np.asarray(colours)
+    if positions.ndim != 2 or positions.shape[1:] != (3,) or len(positions) == 0:
+        raise DataError(path, f"positions must be (N, 3) with N >= 1; got {positions.shape}")
+    if colours.shape != positions.shape or colours.dtype != np.uint8:
+        raise DataError(path, f"colours must be {positions.shape} uint8; got {colours.shape} {colours.dtype}")
+    if not np.isfinite(positions).all():
+        raise DataError(path, "positions must be finite")
+    import trimesh
+
+    content = trimesh.PointCloud(positions, colors=colours).export(file_type="ply")
+    return write_atomic(path, content)

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from lsmgeo._checks import check_flag, check_whole
-from lsmgeo.data.files import child, read_bytes, read_text
-from lsmgeo.data.isolated import isolated
+from lsmgeo.data.isolated import parse_isolated
 from lsmgeo.data.meshes.mesh import DEFAULT_COLOUR, Mesh
 from lsmgeo.data.meshes.mesh_parsing import KINDS, parse_mesh
+from lsmgeo.data.read_files import path_inside, read_bytes, read_text
 from lsmgeo.errors import DataError, LsmGeoError
 
 __all__ = ["load_mesh"]
@@ -91,7 +91,7 @@ def load_mesh(
         if not guarded:
             return _checked(path, parse_mesh(content, *options), max_faces)
         memory = GUARD_MEMORY + GUARD_MEMORY_OF_A_BYTE * len(content)
-        (found,) = isolated(parse_mesh, [path], *options, limit=max_bytes, memory=memory, seconds=GUARD_SECONDS)
+        (found,) = parse_isolated(parse_mesh, [path], *options, limit=max_bytes, memory=memory, seconds=GUARD_SECONDS)
     except ValueError as error:
         raise DataError(path, str(error)) from error
     if isinstance(found, DataError):
@@ -133,7 +133,7 @@ def _material_colours(path: Path, content: bytes) -> dict[str, tuple[float, ...]
     if len(libraries) > MAX_LIBRARIES:
         raise DataError(path, f"names {len(libraries)} material files, the limit is {MAX_LIBRARIES}")
     for library in libraries:
-        file = child(path.parent, library, path)
+        file = path_inside(path.parent, library, path)
         if not file.exists():
             continue
         current = None

@@ -230,9 +230,9 @@ def _gltf(content: bytes, max_faces: int, text: Any) -> Parsed:
     if any(not str(buffer.get("uri", "data:")).startswith("data:") for buffer in buffers):
         raise Unreadable("has a buffer outside the file, which is not read")
     for buffer in buffers:
-        told, text_of_it = _whole(buffer["byteLength"]), buffer.get("uri", "").partition(",")[2]
-        if "uri" in buffer and len(base64.b64decode(text_of_it, validate=True)) < told:
-            raise Unreadable(f"has a buffer of fewer bytes than the {told} that it announces")
+        length, encoded = _whole(buffer["byteLength"]), buffer.get("uri", "").partition(",")[2]
+        if "uri" in buffer and len(base64.b64decode(encoded, validate=True)) < length:
+            raise Unreadable(f"has a buffer of fewer bytes than the {length} that it announces")
     if any("sparse" in accessor or "bufferView" not in accessor for accessor in accessors):
         raise Unreadable("has a sparse or empty accessor, which is not read")
     # trimesh itself compares these with the buffers by assertions, which Python may be told to leave out.

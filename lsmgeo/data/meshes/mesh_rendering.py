@@ -1,4 +1,4 @@
-"""Pictures of meshes on the CPU: colour, depth, normals and silhouettes, shaded as analytic scenes are."""
+"""Images of meshes on the CPU: colour, depth, normals and silhouettes, shaded as analytic scenes are."""
 
 from __future__ import annotations
 
@@ -83,8 +83,8 @@ def render_mesh(
         >>> box = data.from_trimesh(trimesh.creation.box((0.5, 0.5, 0.5)))
         >>> view = cameras.orbit(torch.zeros(1), 0.0, 2.0, focal_length=60.0, height=33, width=33)
         >>> sun = scenes.Lights(torch.tensor([[1.0, 0.0, 0.0]]), torch.full((1, 3), 0.8), torch.full((3,), 0.2))
-        >>> picture = data.render_mesh(box, view, sun)
-        >>> picture.depth[0, 16, 16], picture.images[0, :, 16, 16], int(picture.mask.sum())
+        >>> rendering = data.render_mesh(box, view, sun)
+        >>> rendering.depth[0, 16, 16], rendering.images[0, :, 16, 16], int(rendering.mask.sum())
         (tensor(1.7500), tensor([0.7000, 0.7000, 0.7000]), 289)
     """
     who = "render_mesh"
@@ -187,7 +187,7 @@ class _Surface:
             towards = direction.astype(np.float32)
             facing = np.flatnonzero((flat @ towards > 0) & (normal @ towards > 0))
             along = np.broadcast_to(direction, (len(facing), 3))
-            lit[facing, index] = ~self.caster.blocked(start[facing], along)
+            lit[facing, index] = ~self.caster.occluded(start[facing], along)
         return torch.from_numpy(lit)
 
 
@@ -285,7 +285,7 @@ class EmbreeCaster:
         distance[hit] = np.where(np.abs(exact - about) <= 1e-4 * (about + size), exact, about)
         return RayHits(face, begin + distance, np.stack((found["u"], found["v"]), 1).astype(np.float64))
 
-    def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    def occluded(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """(N,) bool, whether rays meet the mesh at all in front of their origins."""
         start, along, _ = self._scaled(origins, directions)
         return self.scene.run(start.astype(np.float32), along.astype(np.float32), query="OCCLUDED") >= 0
@@ -368,7 +368,7 @@ class NumpyCaster:
         face[rays], best[rays] = faces[nearer], distance[nearer]
         weights[rays] = np.stack((u[nearest], v[nearest]), 1)
 
-    def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    def occluded(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Whether rays meet the mesh at all."""
         return self.first_hits(origins, directions).face >= 0
 

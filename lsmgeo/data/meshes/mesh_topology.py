@@ -11,15 +11,15 @@ from lsmgeo.errors import BackendError
 __all__ = [
     "Edges",
     "Parts",
-    "are_real",
+    "are_nondegenerate",
     "components",
     "corner_normals",
-    "disagreeing",
     "distinct_faces",
     "edges_of",
     "face_normals",
     "is_watertight",
     "merged_faces",
+    "misoriented_faces",
     "parts_of",
 ]
 
@@ -67,7 +67,7 @@ def merged_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return number[faces]
 
 
-def are_real(faces: np.ndarray) -> np.ndarray:
+def are_nondegenerate(faces: np.ndarray) -> np.ndarray:
     """(F,) bool, whether the three vertices of a face differ."""
     return (faces != np.roll(faces, 1, axis=1)).all(1)
 
@@ -97,7 +97,7 @@ def edges_of(faces: np.ndarray) -> Edges:
 def is_watertight(vertices: np.ndarray, faces: np.ndarray) -> bool:
     """Whether every edge belongs to exactly two faces, coinciding vertices taken as one, faces of no area left out."""
     merged = merged_faces(vertices, faces)
-    merged = merged[are_real(merged)]
+    merged = merged[are_nondegenerate(merged)]
     return len(merged) > 0 and bool((np.bincount(edges_of(merged).edge) == 2).all())
 
 
@@ -115,7 +115,7 @@ def components(count: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def parts_of(faces: np.ndarray) -> Parts:
-    """Split faces that pass `are_real`, by merged vertices, into parts connected through edges."""
+    """Split faces that pass `are_nondegenerate`, by merged vertices, into parts connected through edges."""
     edges = edges_of(faces)
     same = np.flatnonzero(edges.edge[1:] == edges.edge[:-1])
     part = components(len(faces), edges.face[same], edges.face[same + 1])
@@ -139,7 +139,7 @@ def parts_of(faces: np.ndarray) -> Parts:
     return Parts(part, closed, oriented, doubled)
 
 
-def disagreeing(faces: np.ndarray) -> np.ndarray:
+def misoriented_faces(faces: np.ndarray) -> np.ndarray:
     """Which faces to reverse, (F,) bool, so that neighbours over edges of two faces agree, as far as that can be.
 
     Every face has two states, as it is and reversed, and each edge of two faces links the states that agree. All that

@@ -10,7 +10,14 @@ from torch import Tensor
 
 from lsmgeo._checks import check_flag
 from lsmgeo.data.meshes import Mesh, check_mesh
-from lsmgeo.data.meshes.mesh_topology import Parts, are_real, disagreeing, distinct_faces, merged_faces, parts_of
+from lsmgeo.data.meshes.mesh_topology import (
+    Parts,
+    are_nondegenerate,
+    distinct_faces,
+    merged_faces,
+    misoriented_faces,
+    parts_of,
+)
 from lsmgeo.data.meshes.scan_conversion import LINES, Line, cells_touched, crossing_counts, line_extent
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid
@@ -94,9 +101,9 @@ def voxelise(
     solid = np.zeros(count, bool)
     for faces, lines, signed in plan_voxels(mesh):
         if len(faces):
-            solid |= _by_vote(points[faces], count, lines, signed=signed)
+            solid |= _vote_inside(points[faces], count, lines, signed=signed)
     if keep_thin:
-        solid = _with_thin(solid, cells_touched(points[mesh.faces], count))
+        solid = _add_thin(solid, cells_touched(points[mesh.faces], count))
     return torch.from_numpy(np.ascontiguousarray(solid.transpose(2, 1, 0)))
 
 
@@ -108,7 +115,7 @@ def plan_voxels(mesh: Mesh) -> tuple[Group, ...]:
     """
     faces = mesh.faces
     merged = merged_faces(mesh.vertices, faces)
-    real = are_real(merged)
+    real = are_nondegenerate(merged)
     merged, faces = merged[real], faces[real]
     if len(faces) == 0:
         return ()
@@ -120,7 +127,7 @@ def plan_voxels(mesh: Mesh) -> tuple[Group, ...]:
         parts = parts_of(merged)
     if (parts.closed & ~parts.oriented).any():
         turned = (parts.closed & ~parts.oriented)[parts.part]
-        turned[turned] = disagreeing(merged[turned])
+        turned[turned] = misoriented_faces(merged[turned])
         merged, faces = (np.where(turned[:, None], names[:, ::-1], names) for names in (merged, faces))
         parts = parts_of(merged)
     closed, oriented = parts.closed[parts.part], parts.oriented[parts.part]
@@ -172,7 +179,7 @@ def winding_number(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return result
 
 
-def _by_vote(triangles: np.ndarray, count: Shape, lines: Sequence[Line], *, signed: bool) -> np.ndarray:
+def _vote_inside(triangles: np.ndarray, count: Shape, lines: Sequence[Line], *, signed: bool) -> np.ndarray:
     """(W, H, D) bool: most of the lines through a centre that cross a balanced surface say inside."""
     votes = np.zeros(count, np.int8)
     for line in lines:
@@ -186,7 +193,7 @@ def _by_vote(triangles: np.ndarray, count: Shape, lines: Sequence[Line], *, sign
             passed = running[window]
             inside = passed != 0 if signed else passed % 2 != 0
             slabs[step] += np.where(balanced[window], np.where(inside, 1, -1), 0).astype(np.int8)
-    return _decided(votes)
+    return _majority(votes)
 
 
 def _windows(count: Shape, line: Line) -> Iterator[tuple[int, tuple[slice, slice]]]:
@@ -198,7 +205,7 @@ def _windows(count: Shape, line: Line) -> Iterator[tuple[int, tuple[slice, slice
         yield step, (slice(column, column + columns), slice(row, row + rows))
 
 
-def _decided(votes: np.ndarray) -> np.ndarray:
+def _majority(votes: np.ndarray) -> np.ndarray:
     """Votes > 0; a tie goes with its decided neighbours, from the rim inwards."""
     sign = np.pad(np.sign(votes), 1)
     flat = sign.reshape(-1)
@@ -216,7 +223,7 @@ def _decided(votes: np.ndarray) -> np.ndarray:
     return sign[1:-1, 1:-1, 1:-1] > 0
 
 
-def _with_thin(solid: np.ndarray, touched: np.ndarray) -> np.ndarray:
+def _add_thin(solid: np.ndarray, touched: np.ndarray) -> np.ndarray:
     """Add touched voxels that no solid voxel stands for.
 
     One stands for the surface in a voxel if it is next to it along the axes of the surface's normals there: behind a
@@ -226,21 +233,21 @@ def _with_thin(solid: np.ndarray, touched: np.ndarray) -> np.ndarray:
     # A face that just grazes a voxel may have been seen in the next one only.
     normals = touched
     for axis in range(3):
-        normals = _spread(normals, axis)
+        normals = _dilate(normals, axis)
     normals = np.where(touched > 0, normals, 0)
     for axes in range(1, 8):
         near = solid
         for axis in range(3):
-            near = _spread(near, axis) if axes >> axis & 1 else near
+            near = _dilate(near, axis) if axes >> axis & 1 else near
         lost |= (normals == axes) & ~near
     if not lost.any():
         return solid
     # Where a rod meets a board, both pass through one voxel, and the board stands for it: join them.
-    beside_lost, beside_solid = (np.any([_spread(cells, axis) for axis in range(3)], axis=0) for cells in (lost, solid))
+    beside_lost, beside_solid = (np.any([_dilate(cells, axis) for axis in range(3)], axis=0) for cells in (lost, solid))
     return solid | lost | ((touched > 0) & beside_lost & beside_solid)
 
 
-def _spread(cells: np.ndarray, axis: int) -> np.ndarray:
+def _dilate(cells: np.ndarray, axis: int) -> np.ndarray:
     """Cells or-ed with their two neighbours along an axis."""
     result = cells.copy()
     there, here = (np.moveaxis(array, axis, 0) for array in (result, cells))

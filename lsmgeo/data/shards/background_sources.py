@@ -1,4 +1,4 @@
-"""What stands behind the objects of a shard's pictures, which hold the objects alone."""
+"""What stands behind the objects of a shard's images, which hold the objects alone."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import TypeAlias
 import numpy as np
 
 from lsmgeo._checks import check_number, describe
-from lsmgeo.data.files import child
 from lsmgeo.data.images import SUFFIXES, read_image
+from lsmgeo.data.read_files import path_inside
 from lsmgeo.errors import DataError, OptionError
 
 __all__ = ["Background", "BackgroundError", "BackgroundSource", "make_background"]
@@ -44,13 +44,13 @@ def _analytic(generator: np.random.Generator | None, height: int, width: int) ->
 def _cutting(
     folder: Path, names: tuple[str, ...], generator: np.random.Generator | None, height: int, width: int
 ) -> np.ndarray:
-    """A cutting of a photograph: any place, half to all of the largest size that fits, scaled to what is needed."""
+    """A cutting of an image: any place, half to all of the largest size that fits, scaled to what is needed."""
     from PIL import Image
 
     if generator is None:
-        raise OptionError("background: a folder of pictures needs a generator")
+        raise OptionError("background: a folder of images needs a generator")
     name = names[int(generator.random() * len(names))]
-    pixels = read_image(child(folder, name, folder))
+    pixels = read_image(path_inside(folder, name, folder))
     scale = min(pixels.shape[0] / height, pixels.shape[1] / width) * (0.5 + 0.5 * generator.random())
     tall, wide = (max(1, round(side * scale)) for side in (height, width))
     top = int(generator.random() * (pixels.shape[0] - tall + 1))
@@ -65,11 +65,11 @@ def make_background(background: Background) -> BackgroundSource:
 
     Args:
         background: "white"; an RGB colour in [0, 1]; "random" for analytic ones (`lsmgeo.scenes.background`); a folder
-            of PNG or JPEG pictures, of which random cuttings are taken; or something that this function made before.
+            of PNG or JPEG images, of which random cuttings are taken; or something that this function made before.
 
     Raises:
         OptionError: something else.
-        DataError: the folder cannot be read or holds no picture.
+        DataError: the folder cannot be read or holds no image.
 
     Example:
         >>> make_background("white")(None, 48, 64).ravel().tolist()
@@ -100,5 +100,5 @@ def _folder(folder: Path) -> BackgroundSource:
     except (OSError, ValueError) as error:
         raise DataError(folder, f"is no folder of backgrounds, 'white' or 'random' ({error})") from error
     if not names:
-        raise DataError(folder, "holds no PNG or JPEG picture")
+        raise DataError(folder, "holds no PNG or JPEG image")
     return partial(_cutting, folder, names)

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple, Self
 import torch
 
 from lsmgeo._checks import check_flag, check_whole
-from lsmgeo.data.files import refusing
 from lsmgeo.data.formats.format_lsm import read_lsm_object
 from lsmgeo.data.formats.format_r2n2 import METADATA, read_r2n2
 from lsmgeo.data.json_files import read_json
+from lsmgeo.data.read_files import os_errors_as_data_errors
 from lsmgeo.data.sample import Sample
-from lsmgeo.data.shards.render_set import Made, make_set
+from lsmgeo.data.shards.render_set import SetResult, write_set
 from lsmgeo.data.shards.shape_sources import FileSource, Recipe, Rendered, rendered, sort_paths, split_by_name, walk
 from lsmgeo.data.shards.shard_metadata import MAX_SIDE, MAX_VOXELS
 from lsmgeo.errors import DataError
@@ -44,7 +44,7 @@ def convert_set(
     on_error: str = "skip",
     overwrite: bool = False,
     progress: bool = False,
-) -> Made:
+) -> SetResult:
     """Convert a tree of the LSM release or of 3D-R2N2's renderings into shards, once, as `ShardSet` reads them.
 
     Parsers that a file can crash run in processes of their own; an object with such a file is left out like any other
@@ -71,7 +71,7 @@ def convert_set(
         progress: show a bar.
 
     Returns:
-        `Made`.
+        `SetResult`.
 
     Raises:
         OptionError: an option out of range, or joblib or SciPy is missing.
@@ -90,7 +90,7 @@ def convert_set(
         recipe = Recipe(views=24, size=137, voxels=(32,), depth=False)
     if voxels is not None:
         recipe = recipe._replace(voxels=tuple(voxels))
-    return make_set(
+    return write_set(
         tree,
         out,
         recipe,
@@ -182,7 +182,7 @@ def _key(name: str) -> str:
 def _check(sample: Sample, grids: tuple[torch.Tensor, ...], folder: Path) -> None:
     """Refuse what no shard holds."""
     if max(sample.images.shape[2:]) > MAX_SIDE or any(len(grid) > MAX_VOXELS for grid in grids):
-        raise DataError(folder, f"has pictures beyond {MAX_SIDE} pixels or voxels beyond {MAX_VOXELS} a side")
+        raise DataError(folder, f"has images beyond {MAX_SIDE} pixels or voxels beyond {MAX_VOXELS} a side")
     if sample.mask is None or not bool(sample.mask.any()):
         raise DataError(folder, "is seen in none of its views")
     if sample.depth is not None and float(sample.depth.max()) > MAX_DEPTH:
@@ -251,7 +251,7 @@ def open_tree(source: str | Path, splits: str | Path | None = None) -> ObjectTre
 
 
 def _lsm_folders(root: Path) -> Iterator[Path]:
-    with refusing(root, "read"):
+    with os_errors_as_data_errors(root, "read"):
         for synset in (root / "renders").iterdir():
             if synset.is_dir() and not synset.is_symlink():
                 yield from (folder for folder in synset.iterdir() if folder.is_dir() and not folder.is_symlink())

@@ -35,7 +35,7 @@ class ShapeDataset(Dataset[Sample]):
     with its text). With ``on_error="skip"`` another shape stands in for it, drawn by a hash of seed, epoch and index;
     a line goes to `bad_samples`, and where more than `max_bad_fraction` of the data set is bad, the error is raised
     after all. Each process counts the different bad shapes that it met itself: with W workers the limit may be passed
-    up to W times over before one of them stops. A picture of the folder of backgrounds that cannot be used is no fault
+    up to W times over before one of them stops. An image of the folder of backgrounds that cannot be used is no fault
     of a shape and raises in any case.
 
     Args:

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from lsmgeo._checks import check_flag, describe, is_whole
-from lsmgeo.data.files import child
 from lsmgeo.data.images import DEPTH, RGBA, PngKind, decode_png
+from lsmgeo.data.read_files import path_inside
 from lsmgeo.data.sample import Sample
 from lsmgeo.data.shards.background_sources import Background, BackgroundError, make_background
 from lsmgeo.data.shards.shard_index import ShardFile, ShardIndex, read_index
@@ -24,7 +24,7 @@ from lsmgeo.errors import DataError, OptionError
 __all__ = ["ShardSet"]
 
 OPEN_FILES = 128
-# Of all pictures of one call. Flat pictures pack a thousandfold: small tars may hold more than any memory does.
+# Of all images of one call. Flat images pack a thousandfold: small tars may hold more than any memory does.
 MAX_PIXELS_AT_ONCE = 1 << 28
 
 
@@ -70,7 +70,7 @@ class ShardSet:
             raise DataError(folder, f"cannot be read ({error})") from error
         if not names:
             raise DataError(folder, "holds no shard (*.tar)")
-        self._shards = [read_index(child(self.folder, name, self.folder)) for name in names]
+        self._shards = [read_index(path_inside(self.folder, name, self.folder)) for name in names]
         self._ends = np.cumsum([len(shard) for shard in self._shards]).tolist()
         self.names = [name for shard in self._shards for name in shard.names]
         self.categories = [category for shard in self._shards for category in shard.categories]
@@ -115,7 +115,7 @@ class ShardSet:
         if metadata.name != shard.names[row]:
             raise DataError(shard.path, f"{shard.keys[row]}.json has changed since it was opened")
         if len(metadata.intrinsics) != self.view_counts[index]:
-            reason = f"tells of {len(metadata.intrinsics)} views, the shard holds {self.view_counts[index]}"
+            reason = f"states {len(metadata.intrinsics)} views; the shard holds {self.view_counts[index]}"
             raise DataError(shard.path, f"{shard.keys[row]}.json: {reason}")
         return metadata
 
@@ -137,16 +137,16 @@ class ShardSet:
             depth: whether to read depth.
             occupancy: the resolution of the occupancy to read, or None for none.
             background: what stands behind the object: "white", an RGB colour in [0, 1], "random" or a folder of
-                pictures; the last two draw another for each view.
+                images; the last two draw another for each view.
             generator: what they are drawn with.
 
         Returns:
-            The sample: float32 cameras, the mask where the pictures' alpha is above 127.
+            The sample: float32 cameras, the mask where the images' alpha is above 127.
 
         Raises:
             OptionError: no such shape or view, or an option that is none.
             DataError: what is asked for is not in the shard, it is damaged, it is more than 2^28 pixels at once (views
-                times height times width), or a picture of the folder of backgrounds cannot be used.
+                times height times width), or an image of the folder of backgrounds cannot be used.
         """
         shard, row = self._locate(index)
         key, metadata = shard.keys[row], self.metadata(index)
@@ -160,20 +160,20 @@ class ShardSet:
                 f"{MAX_PIXELS_AT_ONCE} pixels that are read at once; read fewer views",
             )
         # All are read before anything of their size is made: what a damaged json claims is made by nobody.
-        pictures = [self._picture(shard, row, f"{view:02d}.png", RGBA, metadata) for view in chosen]
+        rgba = [self._read_png(shard, row, f"{view:02d}.png", RGBA, metadata) for view in chosen]
         images = np.empty((len(chosen), 3, *metadata.size), np.float32)
         masks = np.empty((len(chosen), *metadata.size), np.bool_)
-        for image, mask, picture in zip(images, masks, pictures, strict=True):
+        for image, mask, pixels in zip(images, masks, rgba, strict=True):
             try:
                 behind = source(generator, height, width)
             except DataError as error:
                 raise BackgroundError(error.path, error.reason) from error
-            _composite(image, mask, picture, behind)
+            _composite(image, mask, pixels, behind)
         depths = grid = None
         if check_flag("ShardSet.read", "depth", depth):
             if metadata.depth_step is None:
                 raise DataError(shard.path, f"{key} has no depth; read it with depth=False")
-            steps = [self._picture(shard, row, f"{view:02d}.depth.png", DEPTH, metadata) for view in chosen]
+            steps = [self._read_png(shard, row, f"{view:02d}.depth.png", DEPTH, metadata) for view in chosen]
             depths = torch.from_numpy(np.stack(steps).astype(np.float32) * np.float32(metadata.depth_step))
         if occupancy is not None:
             if occupancy not in metadata.voxels or isinstance(occupancy, bool):
@@ -192,7 +192,7 @@ class ShardSet:
             metadata.name,
         )
 
-    def _picture(self, shard: ShardIndex, row: int, suffix: str, kind: PngKind, metadata: Metadata) -> np.ndarray:
+    def _read_png(self, shard: ShardIndex, row: int, suffix: str, kind: PngKind, metadata: Metadata) -> np.ndarray:
         content = self._fetch(shard, row, suffix)
         return decode_png(content, metadata.size, kind, shard.path, f"{shard.keys[row]}.{suffix}")
 
@@ -221,9 +221,9 @@ def _views(views: Sequence[int] | None, there: int) -> Sequence[int]:
     return chosen
 
 
-def _composite(image: np.ndarray, mask: np.ndarray, picture: np.ndarray, background: np.ndarray) -> None:
-    """Fill (3, H, W) with the colours of an RGBA picture where its alpha is above 127, else with the background."""
-    planes = np.ascontiguousarray(picture.transpose(2, 0, 1))
+def _composite(image: np.ndarray, mask: np.ndarray, rgba: np.ndarray, background: np.ndarray) -> None:
+    """Fill (3, H, W) with the colours of an RGBA image where its alpha is above 127, else with the background."""
+    planes = np.ascontiguousarray(rgba.transpose(2, 0, 1))
     np.greater(planes[3], 127, out=mask)
     np.divide(planes[:3], np.float32(255), out=image, dtype=np.float32)
     np.copyto(image, background, where=~mask)

@@ -15,15 +15,16 @@ from typing import NamedTuple
 import torch
 
 from lsmgeo._checks import check_choice, check_flag, check_whole
-from lsmgeo.data.files import is_abandoned
+from lsmgeo.data.atomic_files import is_abandoned
+from lsmgeo.data.sample import MAX_VIEWS
 from lsmgeo.data.shards import hash_settings, verify_shard, write_shard
 from lsmgeo.data.shards.shape_sources import Recipe, Source, open_source
-from lsmgeo.data.shards.shard_index import MAX_SHAPES, ShardFile, read_index, read_seal, sidecar_path
+from lsmgeo.data.shards.shard_index import MAX_SHAPES, ShardFile, read_index, read_sidecar, sidecar_path
 from lsmgeo.data.shards.shard_members import encode_sample
-from lsmgeo.data.shards.shard_metadata import MAX_SIDE, MAX_VIEWS, MAX_VOXELS
+from lsmgeo.data.shards.shard_metadata import MAX_SIDE, MAX_VOXELS
 from lsmgeo.errors import DataError, OptionError
 
-__all__ = ["Made", "make_set", "render_set"]
+__all__ = ["SetResult", "render_set", "write_set"]
 
 # Where workers tell how far they are, one byte a shape.
 PROGRESS = ".progress"
@@ -31,7 +32,7 @@ SECONDS_BETWEEN_LOOKS = 0.5
 SECONDS_BETWEEN_LINES = 30.0
 
 
-class Made(NamedTuple):
+class SetResult(NamedTuple):
     """What became of a set.
 
     Attributes:
@@ -47,7 +48,7 @@ class Made(NamedTuple):
     skipped: tuple[tuple[str, str], ...]
 
 
-class _Task(NamedTuple):
+class _ShardTask(NamedTuple):
     """One shard: shapes start to stop."""
 
     source: Source
@@ -69,7 +70,7 @@ def render_set(
     on_error: str = "skip",
     overwrite: bool = False,
     progress: bool = False,
-) -> Made:
+) -> SetResult:
     """Render a set of shapes into shards, ``NAME-000000.tar`` and so on, as `ShardSet` reads them.
 
     With one installation of the library the bytes depend on the source, the recipe and ``per_shard`` alone, not on the
@@ -91,7 +92,7 @@ def render_set(
         progress: show a bar.
 
     Returns:
-        `Made`.
+        `SetResult`.
 
     Raises:
         OptionError: an option out of range, or joblib is missing.
@@ -106,7 +107,7 @@ def render_set(
         >>> made.shapes, [path.name for path in made.shards]
         (3, ['synthetic-13-000000.tar'])
     """
-    return make_set(
+    return write_set(
         open_source(source, shapes),
         out,
         Recipe() if recipe is None else recipe,
@@ -120,7 +121,7 @@ def render_set(
     )
 
 
-def make_set(
+def write_set(
     source: Source,
     out: str | Path,
     recipe: Recipe,
@@ -132,7 +133,7 @@ def make_set(
     progress: bool,
     who: str,
     where: str | Path,
-) -> Made:
+) -> SetResult:
     """Make the shards of any source; see `render_set`, whose options these are.
 
     ``who`` stands before an option's name in errors, ``where`` is the source as the caller named it.
@@ -147,24 +148,24 @@ def make_set(
         raise DataError(out, "is a file; the shards need a folder")
     tasks = _tasks(source, out, recipe, per_shard, on_error)
     _refuse_other_shards(out, tasks, overwrite)
-    told = [_progress(task.path) for task in tasks]
+    reports = [_progress_file(task.path) for task in tasks]
     half_written = f".{glob.escape(source.name)}-{'[0-9]' * 6}.*.tmp"
     try:
         (out / PROGRESS).mkdir(parents=True, exist_ok=True)
         left = [path for path in out.glob(half_written) if is_abandoned(path)]  # by a run that was killed
-        for path in (*told, *left):
+        for path in (*reports, *left):
             path.unlink(missing_ok=True)
     except OSError as error:
         raise DataError(out, f"cannot be written ({error})") from error
     try:
-        with _bar(told, tasks[-1].stop, recipe.views, progress):
+        with _progress_bar(reports, tasks[-1].stop, recipe.views, progress):
             done = _run(who, tasks, jobs)
     finally:
         with contextlib.suppress(OSError):
-            for path in told:
+            for path in reports:
                 path.unlink(missing_ok=True)
             (out / PROGRESS).rmdir()
-    made = Made(
+    made = SetResult(
         tuple(path for one in done for path in one.shards),
         sum(one.shapes for one in done),
         sum(one.kept for one in done),
@@ -190,16 +191,16 @@ def _check(who: str, recipe: Recipe, per_shard: int, jobs: int, on_error: str) -
     check_choice(who, "on_error", on_error, ("skip", "raise"))
 
 
-def _tasks(source: Source, out: Path, recipe: Recipe, per_shard: int, on_error: str) -> list[_Task]:
+def _tasks(source: Source, out: Path, recipe: Recipe, per_shard: int, on_error: str) -> list[_ShardTask]:
     tasks = []
     for number, start in enumerate(range(0, len(source), per_shard)):
         stop = min(start + per_shard, len(source))
         path = out / f"{source.name}-{number:06d}.tar"
-        tasks.append(_Task(source.part(start, stop), recipe, start, stop, path, on_error))
+        tasks.append(_ShardTask(source.part(start, stop), recipe, start, stop, path, on_error))
     return tasks
 
 
-def _refuse_other_shards(out: Path, tasks: list[_Task], overwrite: bool) -> None:
+def _refuse_other_shards(out: Path, tasks: list[_ShardTask], overwrite: bool) -> None:
     """Refuse a folder that would come to hold two sets in one."""
     name = tasks[0].source.name
     ours = {task.path for task in tasks}
@@ -210,7 +211,7 @@ def _refuse_other_shards(out: Path, tasks: list[_Task], overwrite: bool) -> None
         if overwrite and path in ours:
             continue
         try:
-            settings = read_seal(ShardFile(path)).settings
+            settings = read_sidecar(ShardFile(path)).settings
         except DataError:  # what is damaged is made again
             continue
         if not settings.startswith(recipe):
@@ -222,18 +223,18 @@ def _recipe_hash(recipe: Recipe) -> str:
     return hash_settings(recipe._asdict())[:32]
 
 
-def _run(who: str, tasks: list[_Task], jobs: int) -> list[Made]:
+def _run(who: str, tasks: list[_ShardTask], jobs: int) -> list[SetResult]:
     if jobs == 1:
-        return [_make(task) for task in tasks]
+        return [_write_shard(task) for task in tasks]
     try:
         import joblib
     except ImportError as error:
         raise OptionError(f"{who}: jobs other than 1 need joblib; install lsmgeo[data]") from error
-    result: list[Made] = joblib.Parallel(n_jobs=jobs)(joblib.delayed(_make)(task) for task in tasks)
+    result: list[SetResult] = joblib.Parallel(n_jobs=jobs)(joblib.delayed(_write_shard)(task) for task in tasks)
     return result
 
 
-def _make(task: _Task) -> Made:
+def _write_shard(task: _ShardTask) -> SetResult:
     """Make one shard, or find that it is there."""
     made_from = hash_settings({"shapes": [task.start, task.stop], "source": task.source.identity()})
     settings = f"{_recipe_hash(task.recipe)}-{made_from}"
@@ -241,10 +242,10 @@ def _make(task: _Task) -> Made:
         there = {int(key) for key in read_index(task.path).keys}
         missing = [index for index in range(task.start, task.stop) if index not in there]
         if not missing or task.on_error == "skip":
-            _tell(task.path, task.stop - task.start)
+            _report_progress(task.path, task.stop - task.start)
             reason = "could not be used when its shard was made"
             left_out = tuple((task.source.file(index), reason) for index in missing)
-            return Made((task.path,), len(there), 1, left_out)
+            return SetResult((task.path,), len(there), 1, left_out)
     skipped: list[tuple[str, str]] = []
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the cores are the workers', and one thread's sums have one order
@@ -254,14 +255,14 @@ def _make(task: _Task) -> Made:
         if first is None:
             task.path.unlink(missing_ok=True)
             sidecar_path(task.path).unlink(missing_ok=True)
-            return Made((), 0, 0, tuple(skipped))
+            return SetResult((), 0, 0, tuple(skipped))
         write_shard(task.path, chain([first], items), settings)
     finally:
         torch.set_num_threads(threads)
-    return Made((task.path,), task.stop - task.start - len(skipped), 0, tuple(skipped))
+    return SetResult((task.path,), task.stop - task.start - len(skipped), 0, tuple(skipped))
 
 
-def _items(task: _Task, skipped: list[tuple[str, str]]) -> Iterator[tuple[int, dict[str, bytes]]]:
+def _items(task: _ShardTask, skipped: list[tuple[str, str]]) -> Iterator[tuple[int, dict[str, bytes]]]:
     """The shapes of a task, encoded one at a time; those that cannot be used go to ``skipped``."""
     for index in range(task.start, task.stop):
         try:
@@ -282,22 +283,22 @@ def _items(task: _Task, skipped: list[tuple[str, str]]) -> Iterator[tuple[int, d
                     split=rendered.split,
                 ),
             )
-        _tell(task.path, 1)
+        _report_progress(task.path, 1)
 
 
-def _progress(path: Path) -> Path:
+def _progress_file(path: Path) -> Path:
     """The file in which the worker of a shard tells how far it is."""
     return path.parent / PROGRESS / path.stem
 
 
-def _tell(path: Path, shapes: int) -> None:
+def _report_progress(path: Path, shapes: int) -> None:
     """Add to the shapes that a shard's worker has finished; a report that cannot be written is no reason to stop."""
-    with contextlib.suppress(OSError), _progress(path).open("ab") as stream:
+    with contextlib.suppress(OSError), _progress_file(path).open("ab") as stream:
         stream.write(bytes(shapes))
 
 
 @contextlib.contextmanager
-def _bar(told: list[Path], shapes: int, views: int, shown: bool) -> Iterator[None]:
+def _progress_bar(reports: list[Path], shapes: int, views: int, shown: bool) -> Iterator[None]:
     """A progress bar over the views of all workers, fed by what they tell; in a log, a line now and then."""
     if not shown:
         yield
@@ -310,7 +311,7 @@ def _bar(told: list[Path], shapes: int, views: int, shown: bool) -> Iterator[Non
 
         def look() -> None:
             with contextlib.suppress(OSError):
-                bar.update(views * sum(path.stat().st_size for path in told if path.exists()) - bar.n)
+                bar.update(views * sum(path.stat().st_size for path in reports if path.exists()) - bar.n)
 
         def watch() -> None:
             while not finished.wait(SECONDS_BETWEEN_LOOKS):

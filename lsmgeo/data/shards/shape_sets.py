@@ -40,7 +40,7 @@ class ShapeSpec(NamedTuple):
 
     shape: synthetic13.SyntheticShape
     cameras: CameraTensors  # (V,) float64
-    told: CameraTensors  # what the model is told
+    model_cameras: CameraTensors  # the cameras that the model gets, which pose noise may have moved
     backgrounds: Tensor  # (V, 3, H, W) or (V, 3, 1, 1)
     occupancy: Tensor | None
 
@@ -59,7 +59,7 @@ def render_shapes(
     device = torch.device("cpu") if device is None else device
     cameras = zip(*(spec.cameras for spec in specs), strict=True)
     lights = [spec.shape.lights for spec in specs]
-    picture = scenes.render(
+    rendering = scenes.render(
         [spec.shape.scene for spec in specs],
         CameraTensors(*(pad_with_first([*map(torch.as_tensor, values)]).to(device) for values in cameras)),
         Lights(  # dark ones where a shape has fewer
@@ -73,7 +73,7 @@ def render_shapes(
     return [
         Sample(
             images[: len(spec.backgrounds)],
-            to(spec.told, device),
+            to(spec.model_cameras, device),
             depths[: len(spec.backgrounds)] if depth else None,
             mask[: len(spec.backgrounds)],
             None if spec.occupancy is None else spec.occupancy.to(device),
@@ -81,7 +81,7 @@ def render_shapes(
             spec.shape.category,
             spec.shape.name,
         )
-        for spec, images, depths, mask in zip(specs, picture.images, picture.depth, picture.mask, strict=True)
+        for spec, images, depths, mask in zip(specs, rendering.images, rendering.depth, rendering.mask, strict=True)
     ]
 
 
@@ -159,7 +159,7 @@ class SyntheticSet:
         draw = make_background(background)
         behind = [draw(generator, self.size, self.size) for _ in chosen]
         cameras = CameraTensors(*(torch.as_tensor(values)[chosen] for values in spec.cameras))
-        spec = spec._replace(cameras=cameras, told=cameras, backgrounds=torch.from_numpy(np.stack(behind)))
+        spec = spec._replace(cameras=cameras, model_cameras=cameras, backgrounds=torch.from_numpy(np.stack(behind)))
         return _single(render_shapes([spec], depth=depth)[0]) if self.is_rendered else spec
 
 

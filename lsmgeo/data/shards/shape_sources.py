@@ -16,6 +16,7 @@ from torch import Tensor
 
 from lsmgeo import scenes
 from lsmgeo._checks import check_whole
+from lsmgeo.data.formats.synsets import synset_category
 from lsmgeo.data.sample import Sample
 from lsmgeo.data.shards.shape_sets import describe_shape, render_shapes
 from lsmgeo.data.shards.shard_metadata import is_text
@@ -32,7 +33,6 @@ __all__ = [
     "open_source",
     "rendered",
     "sort_paths",
-    "spell_synset",
     "split_by_name",
     "walk",
 ]
@@ -196,29 +196,19 @@ class MeshFolder(FileSource):
         mesh = normalise(load_mesh(self.root / file))
         cameras = synthetic13.views(recipe.seed, index, recipe.views, recipe.size)
         lights = synthetic13.random_lights(np.random.default_rng([recipe.seed, index, LIGHTS]))
-        picture = render_mesh(mesh, cameras, lights, shadows=recipe.shadows)
-        if not picture.mask.any():
+        rendering = render_mesh(mesh, cameras, lights, shadows=recipe.shadows)
+        if not rendering.mask.any():
             raise DataError(self.root / file, "is seen in none of the views")
         # A lampshade or a sail has hardly a voxel whose centre it holds.
         grids = [voxelise(mesh, resolution, keep_thin=True) for resolution in recipe.voxels]
-        depth = picture.depth if recipe.depth else None
-        sample = Sample(picture.images, cameras, depth, picture.mask, None, file, _category(file), file)
+        depth = rendering.depth if recipe.depth else None
+        sample = Sample(rendering.images, cameras, depth, rendering.mask, None, file, _category(file), file)
         return rendered(sample, grids, split_by_name(file))
 
 
 def _category(file: str) -> str | None:
     first, slash, _ = file.partition("/")
-    return (spell_synset(first) or first) if slash else None
-
-
-def spell_synset(synset: str) -> str | None:
-    """The name of a ShapeNet category, or None.
-
-    Example:
-        >>> spell_synset("03001627")
-        'chair'
-    """
-    return {number: name for name, number in synthetic13.CATEGORIES.items()}.get(synset)
+    return (synset_category(first) or first) if slash else None
 
 
 Source: TypeAlias = Synthetic13 | FileSource

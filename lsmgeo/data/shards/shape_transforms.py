@@ -14,13 +14,13 @@ from lsmgeo.cameras import CameraTensors
 from lsmgeo.data.sample import Sample
 from lsmgeo.data.shards.shape_sets import ShapeSpec
 
-__all__ = ["AdaptedShapes", "resize_sample", "resize_views", "turn_cameras"]
+__all__ = ["TransformedShapes", "perturb_cameras", "resize_sample", "resize_views"]
 
 # The last number of the seed that pose noise is drawn from, unlike any number of another draw.
 NOISE = 0x706F7365
 
 
-class AdaptedShapes(Dataset[Sample | ShapeSpec]):
+class TransformedShapes(Dataset[Sample | ShapeSpec]):
     """The first shapes of a data set at the size of the model's images, the cameras that it is told turned by noise."""
 
     def __init__(self, dataset: Dataset[Any], size: int, noise: float, seed: int, length: int) -> None:
@@ -32,12 +32,12 @@ class AdaptedShapes(Dataset[Sample | ShapeSpec]):
     def __getitem__(self, item: tuple[int, int]) -> Sample | ShapeSpec:
         shape = self.dataset[item]
         if isinstance(shape, ShapeSpec):
-            return shape._replace(told=turn_cameras(shape.cameras, self.noise, self.seed, *item))
+            return shape._replace(model_cameras=perturb_cameras(shape.cameras, self.noise, self.seed, *item))
         shape = resize_sample(shape, self.size)
-        return shape._replace(cameras=turn_cameras(shape.cameras, self.noise, self.seed, *item))
+        return shape._replace(cameras=perturb_cameras(shape.cameras, self.noise, self.seed, *item))
 
 
-def turn_cameras(cameras: CameraTensors, degrees: float, seed: int, epoch: int, index: int) -> CameraTensors:
+def perturb_cameras(cameras: CameraTensors, degrees: float, seed: int, epoch: int, index: int) -> CameraTensors:
     """Cameras turned about the object by up to so many degrees, always the same for a seed, an epoch and an index."""
     if degrees == 0:
         return cameras
@@ -84,7 +84,7 @@ def resize_sample(sample: Sample, size: int) -> Sample:
 
 
 def resize_views(images: Tensor, cameras: CameraTensors, size: int) -> tuple[Tensor, CameraTensors]:
-    """Square pictures of another size, and their cameras: smaller ones hold means of areas, larger are interpolated.
+    """Square images of another size, and their cameras: smaller ones hold means of areas, larger are interpolated.
 
     Args:
         images: (..., 3, H, W) of any size.

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from lsmgeo._checks import describe
-from lsmgeo.data.files import read_bytes
+from lsmgeo.data.read_files import read_bytes
 from lsmgeo.data.shards.shard_members import KEY, SUFFIX
 from lsmgeo.data.shards.shard_metadata import decode_texts, is_text
 from lsmgeo.errors import DataError
@@ -34,12 +34,12 @@ __all__ = [
     "MAX_MEMBERS",
     "MAX_MEMBER_BYTES",
     "MAX_SHAPES",
-    "Seal",
     "ShardFile",
     "ShardIndex",
+    "Sidecar",
+    "add_digest",
     "read_index",
-    "read_seal",
-    "seal",
+    "read_sidecar",
     "sidecar_path",
 ]
 
@@ -54,7 +54,7 @@ END = bytes(BLOCK)
 MEMBER = re.compile(rf"({KEY.pattern})\.({SUFFIX.pattern})\0".encode())
 
 
-class Seal(NamedTuple):
+class Sidecar(NamedTuple):
     """What a sidecar says of its tar: the hash of its settings, its SHA-256, the check sums of its members in order."""
 
     settings: str
@@ -94,7 +94,7 @@ class ShardIndex:
         return len(self.keys)
 
     def view_counts(self) -> np.ndarray:
-        """(N,) how many pictures each shape has."""
+        """(N,) how many images each shape has."""
         counts = [sum(s.endswith(".png") and "depth" not in s for s in layout) for layout in self.layouts]
         return np.array(counts, np.int64)[self.layout]
 
@@ -162,12 +162,12 @@ def sidecar_path(path: Path) -> Path:
     return path.with_suffix(".json")
 
 
-def seal(content: bytes) -> bytes:
+def add_digest(content: bytes) -> bytes:
     """A JSON object with the SHA-256 of the rest of its text as its first value."""
     return SEAL + hashlib.sha256(content[1:]).hexdigest().encode() + b'",' + content[1:]
 
 
-def read_seal(tar: ShardFile) -> Seal:
+def read_sidecar(tar: ShardFile) -> Sidecar:
     """Read and check the sidecar of a shard, also one of version 1, which is an index of its members besides.
 
     Raises:
@@ -178,28 +178,28 @@ def read_seal(tar: ShardFile) -> Seal:
     if not content.startswith(SEAL):
         raise DataError(sidecar, "is not the index of a shard")
     body = content[len(SEAL) + 66 :]
-    if seal(b"{" + body) != content:
+    if add_digest(b"{" + body) != content:
         raise DataError(sidecar, "is damaged (a wrong check sum)")
     try:
         values = json.loads(b"{" + body)
     except (ValueError, RecursionError) as error:
         raise DataError(sidecar, f"is not JSON ({error})") from error
     try:
-        return _seal(values, tar)
+        return _parse_sidecar(values, tar)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise DataError(sidecar, reason) from error
 
 
-def _seal(values: dict[str, Any], tar: ShardFile) -> Seal:
+def _parse_sidecar(values: dict[str, Any], tar: ShardFile) -> Sidecar:
     if values["format"] != "lsmgeo shard index":
         raise ValueError("is not the index of a shard")
     version, settings, sha256 = values["version"], values["settings"], values["sha256"]
     if version not in (1, 2):
         raise ValueError(f"has version {describe(version)}; this program reads 1 and 2")
     if values["tar"] != tar.path.name or values["bytes"] != tar.size:
-        told = f"{describe(values['tar'])} with {describe(values['bytes'])} bytes"
-        raise ValueError(f"tells of {told}; {tar.path.name} has {tar.size}")
+        stated = f"{describe(values['tar'])} with {describe(values['bytes'])} bytes"
+        raise ValueError(f"belongs to {stated}; {tar.path.name} has {tar.size}")
     for field, text, longest in (("settings", settings, 128), ("sha256", sha256, 64)):
         if not is_text(text) or len(text) > longest:
             raise ValueError(f"{field} must be {longest} characters at most; got {describe(text)}")
@@ -207,7 +207,7 @@ def _seal(values: dict[str, Any], tar: ShardFile) -> Seal:
     crc32 = array("q")
     for part in parts:
         crc32.extend(array("q", part))  # refuses what is no whole number of 64 bits
-    return Seal(settings, sha256, crc32)
+    return Sidecar(settings, sha256, crc32)
 
 
 def read_index(path: Path) -> ShardIndex:
@@ -220,7 +220,7 @@ def read_index(path: Path) -> ShardIndex:
         DataError: no such tar, what is there is damaged, or it holds something else.
     """
     tar = ShardFile(path)
-    crc32 = read_seal(tar).crc32 if os.path.lexists(sidecar_path(path)) else None
+    crc32 = read_sidecar(tar).crc32 if os.path.lexists(sidecar_path(path)) else None
     shapes: dict[bytes, dict[bytes, int]] = {}  # the number of each member
     texts: dict[bytes, dict[str, str | None]] = {}
     offsets, sizes = array("q"), array("q")

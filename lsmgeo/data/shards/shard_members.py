@@ -24,8 +24,8 @@ from torch import Tensor
 from lsmgeo._checks import check_number, check_whole, describe
 from lsmgeo.cameras.tensors import check_cameras
 from lsmgeo.data.images import encode_png
-from lsmgeo.data.sample import Sample, check_sample
-from lsmgeo.data.shards.shard_metadata import MAX_SIDE, MAX_VIEWS, MAX_VOXELS, is_text
+from lsmgeo.data.sample import MAX_VIEWS, Sample, check_sample
+from lsmgeo.data.shards.shard_metadata import MAX_SIDE, MAX_VOXELS, is_text
 from lsmgeo.errors import DataError, DTypeError, OptionError, ShapeError
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def encode_sample(
         raise OptionError(f"encode_sample: depth_step must be a positive number of world units; got {step}")
     grids = _grids(who, [*([] if sample.occupancy is None else [sample.occupancy]), *more_occupancy])
     mask = _mask(sample)
-    pictures = _quantised_images(who, sample.images, mask)
+    rgba = _quantised_images(who, sample.images, mask)
     depths = None if sample.depth is None else _quantised_depth(who, sample.depth, step)
     metadata = {
         "key": key,
@@ -140,7 +140,7 @@ def encode_sample(
         seed = check_whole("encode_sample", "seed", seed, 0)
     members = {"json": json.dumps(metadata, separators=(",", ":"), allow_nan=False).encode()}
     for view in range(views):
-        members[f"{view:02d}.png"] = encode_png(pictures[view])
+        members[f"{view:02d}.png"] = encode_png(rgba[view])
         if depths is not None:
             members[f"{view:02d}.depth.png"] = encode_png(depths[view])
     for side in sorted(grids):
@@ -180,10 +180,10 @@ def _quantised_images(who: str, images: Tensor, mask: Tensor) -> np.ndarray:
     if not (low > -1e-3 and high < 1 + 1e-3):
         raise OptionError(f"{who}: images must be in [0, 1]; got [{low:.6g}, {high:.6g}]")
     result = np.zeros((len(images), *images.shape[2:], 4), np.uint8)
-    for picture, image, inside in zip(result, images, mask, strict=True):
+    for rgba, image, inside in zip(result, images, mask, strict=True):
         pixels = image.detach().mul(255).round_().clamp_(0, 255).mul_(inside).to(torch.uint8)
-        picture[..., :3] = pixels.permute(1, 2, 0).numpy(force=True)
-        picture[..., 3] = 255 * inside.numpy(force=True).astype(np.uint8)
+        rgba[..., :3] = pixels.permute(1, 2, 0).numpy(force=True)
+        rgba[..., 3] = 255 * inside.numpy(force=True).astype(np.uint8)
     return result
 
 

@@ -11,16 +11,16 @@ import torch
 from lsmgeo._checks import check_whole, describe
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.cameras.tensors import check_cameras
-from lsmgeo.data.json_files import take_array
+from lsmgeo.data.json_files import read_array
+from lsmgeo.data.sample import MAX_VIEWS
 from lsmgeo.errors import DataError, LsmGeoError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-__all__ = ["MAX_SIDE", "MAX_VIEWS", "MAX_VOXELS", "Metadata", "decode_metadata", "decode_texts", "is_text"]
+__all__ = ["MAX_SIDE", "MAX_VOXELS", "Metadata", "decode_metadata", "decode_texts", "is_text"]
 
-MAX_VIEWS = 1000
 MAX_VOXELS = 256
 MAX_SIDE = 4096
 MAX_BYTES = 1 << 22
@@ -34,8 +34,8 @@ class Metadata(NamedTuple):
     Attributes:
         name, category, split, source, mesh: as in `Sample`; the set it belongs to, where it came from.
         seed: what it was made from, or None.
-        size: (height, width) of its pictures.
-        depth_step: world units of one step of the depth pictures, or None where there are none.
+        size: (height, width) of its images.
+        depth_step: world units of one step of the depth images, or None where there are none.
         intrinsics: (V, 3, 3) float64.
         cam_from_world: (V, 4, 4) float64.
         voxels: the resolutions of its occupancy grids.
@@ -139,7 +139,7 @@ def _metadata(values: dict[str, Any], path: Path, where: str) -> Metadata:
     if not isinstance(cameras, dict):
         raise ValueError(f"cameras must be an object; got {describe(cameras)}")
     K, E = (
-        take_array(cameras, field, (views, side, side), path, where)
+        read_array(cameras, field, (views, side, side), path, where)
         for field, side in (("intrinsics", 3), ("cam_from_world", 4))
     )
     sizes = (torch.full((views,), side) for side in (height, width))

@@ -16,15 +16,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lsmgeo._checks import describe
-from lsmgeo.data.files import atomic_file, write_atomic
+from lsmgeo.data.atomic_files import atomic_file, write_atomic
 from lsmgeo.data.shards.shard_index import (
     BLOCK,
     MAX_MEMBER_BYTES,
     MAX_MEMBERS,
     MAX_SHAPES,
     ShardFile,
-    read_seal,
-    seal,
+    add_digest,
+    read_sidecar,
     sidecar_path,
 )
 from lsmgeo.data.shards.shard_members import SUFFIX, format_key
@@ -34,7 +34,7 @@ from lsmgeo.errors import DataError, OptionError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from lsmgeo.data.files import AtomicFile
+    from lsmgeo.data.atomic_files import AtomicFile
 
 __all__ = ["hash_settings", "verify_shard", "write_shard"]
 
@@ -129,7 +129,7 @@ def verify_shard(path: str | os.PathLike[str], settings_hash: str) -> bool:
     """
     path = Path(path)
     try:
-        found = read_seal(ShardFile(path))
+        found = read_sidecar(ShardFile(path))
         if found.settings != settings_hash:
             return False
         with path.open("rb") as stream:
@@ -202,7 +202,7 @@ class _TarWriter:
             "settings": settings_hash,
             "crc32": self._crc32,
         }
-        return seal(json.dumps(values, separators=(",", ":")).encode() + b"\n")
+        return add_digest(json.dumps(values, separators=(",", ":")).encode() + b"\n")
 
     def _refusal(self, reason: str) -> OptionError:
         return OptionError(f"write_shard: {self._path}: {reason}")

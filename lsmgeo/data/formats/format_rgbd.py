@@ -1,4 +1,4 @@
-"""Recordings of depth sensors: photographs with 16-bit depth, one K, and poses in one table or in files."""
+"""Recordings of depth sensors: images with 16-bit depth, one K, and poses in one table or in files."""
 
 from __future__ import annotations
 
@@ -8,16 +8,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lsmgeo._checks import describe
-from lsmgeo.data.files import child, parse_floats, read_text, refuse_unreadable
 from lsmgeo.data.formats.depth_files import DepthPng
+from lsmgeo.data.formats.scene_assembly import (
+    MAX_PARAMETER,
+    assemble,
+    check_intrinsics,
+    check_last_row,
+    check_rotation,
+    make_cameras,
+)
 from lsmgeo.data.images import image_size
-from lsmgeo.data.posed import MAX_PARAMETER, assemble, check_intrinsics, check_last_row, check_rotation, make_cameras
+from lsmgeo.data.read_files import file_reader, parse_floats, path_inside, read_text
 from lsmgeo.errors import DataError, OptionError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from lsmgeo.data.posed import PosedImages
+    from lsmgeo.data.posed_images import PosedImages
 
 __all__ = ["is_rgbd", "is_seven_scenes", "read_rgbd", "read_seven_scenes"]
 
@@ -44,12 +51,12 @@ def is_rgbd(path: Path) -> bool:
     return all((path / name).is_file() for name in TABLES)
 
 
-@refuse_unreadable
+@file_reader
 def read_rgbd(path: str | Path) -> PosedImages:
     """Read an RGB-D folder with one table of poses, as HoloLens recordings are kept.
 
     ``K.txt`` holds K (3 x 3), ``poses.txt`` 16 numbers a line, the 4 x 4 pose of one frame row by row,
-    ``frame_index.txt`` the name of that frame on the same line; ``images/`` and ``depth/`` the pictures of these names.
+    ``frame_index.txt`` the name of that frame on the same line; ``images/`` and ``depth/`` the images of these names.
     (The form of HoloLens sets in DeepVideoMVS: Duzceker et al., "DeepVideoMVS: Multi-view stereo on video with
     recurrent spatio-temporal fusion", CVPR 2021.)
 
@@ -57,14 +64,14 @@ def read_rgbd(path: str | Path) -> PosedImages:
         The source has camera-to-world poses, OpenCV axes, integer pixel centres, no distortion, and depth as
         millimetres of camera z with 0 where there is none; the poses are inverted, and depth comes in metres.
 
-    Frames are matched by name. A frame whose picture is not there is left out, and so is one whose pose holds a number
+    Frames are matched by name. A frame whose image is not there is left out, and so is one whose pose holds a number
     that is not finite, which is how trackers write that they were lost. A frame without a file of depth has none.
 
     Args:
         path: the folder, or its ``poses.txt``.
 
     Returns:
-        The photographs with cameras and depth, no sparse points.
+        The images with cameras and depth, no sparse points.
 
     Raises:
         DataError: a file is missing, damaged, too large, or names a file outside the folder; or no frame is left.
@@ -86,9 +93,9 @@ def read_rgbd(path: str | Path) -> PosedImages:
     frames = (
         (
             name,
-            child(folder / "images", name, index),
+            path_inside(folder / "images", name, index),
             _parse_pose(row, table, f"line {number}"),
-            child(folder / "depth", str(Path(name).with_suffix(".png")), index),
+            path_inside(folder / "depth", str(Path(name).with_suffix(".png")), index),
         )
         for number, (name, row) in enumerate(zip(names, rows, strict=True), 1)
     )
@@ -116,14 +123,14 @@ def _scene(
     file: Path,
     source: str,
 ) -> PosedImages:
-    """Name, picture, camera-to-world pose and depth of each frame; those without picture or pose are left out."""
+    """Name, image, camera-to-world pose and depth of each frame; those without image or pose are left out."""
     kept = [
-        (name, picture, pose, DepthPng(depth, MILLIMETRE, no_depth) if depth.is_file() else None)
-        for name, picture, pose, depth in frames
-        if pose is not None and picture.is_file()
+        (name, image, pose, DepthPng(depth, MILLIMETRE, no_depth) if depth.is_file() else None)
+        for name, image, pose, depth in frames
+        if pose is not None and image.is_file()
     ]
     if not kept:
-        raise DataError(file, "leaves no frame: every picture is missing or its pose is not finite")
+        raise DataError(file, "leaves no frame: every image is missing or its pose is not finite")
     names, paths, poses, depths = zip(*kept, strict=True)
     for name, pose in zip(names, poses, strict=True):
         check_rotation(pose[:3, :3], file, name)
@@ -149,7 +156,7 @@ def is_seven_scenes(path: Path) -> bool:
     return path.is_dir() and next(path.glob(POSES), None) is not None
 
 
-@refuse_unreadable
+@file_reader
 def read_seven_scenes(path: str | Path, *, intrinsics: tuple[float, float, float, float] = KINECT) -> PosedImages:
     """Read one sequence of 7-Scenes, or of a set kept in its form.
 
@@ -160,20 +167,20 @@ def read_seven_scenes(path: str | Path, *, intrinsics: tuple[float, float, float
     Convention:
         The source has camera-to-world poses and OpenCV axes; the poses are inverted, and depth comes in metres.
 
-    In the set itself colour and depth are *not registered*: they are pictures of two cameras side by side, with some
+    In the set itself colour and depth are *not registered*: they are images of two cameras side by side, with some
     pixels between them, and only the depth camera's K is stated. Its K and poses are used for both, as is customary;
     what is compared across the two (the depth at a pixel of colour) is off by that much near edges. The stated
-    principal point is the middle of the picture, so half a pixel in it means nothing.
+    principal point is the middle of the image, so half a pixel in it means nothing.
 
-    A frame without its colour picture is left out, and so is one whose pose holds a number that is not finite (lost
-    tracking). A frame without its depth picture has no depth.
+    A frame without its colour image is left out, and so is one whose pose holds a number that is not finite (lost
+    tracking). A frame without its depth image has no depth.
 
     Args:
         path: the folder of one sequence, such as ``chess/seq-01``.
         intrinsics: fx, fy, cx, cy in pixels, integer pixel centres, of all frames.
 
     Returns:
-        The colour pictures with cameras and depth, in the order of their names; no sparse points.
+        The colour images with cameras and depth, in the order of their names; no sparse points.
 
     Raises:
         DataError: a file is damaged, too large, or leads outside the folder; or no frame is left.
@@ -192,9 +199,9 @@ def read_seven_scenes(path: str | Path, *, intrinsics: tuple[float, float, float
     frames = (
         (
             f"{stem}.color.png",
-            child(folder, f"{stem}.color.png", folder),
-            _parse_pose(read_text(child(folder, file.name, folder), MAX_POSE_BYTES), file, "the pose"),
-            child(folder, f"{stem}.depth.png", folder),
+            path_inside(folder, f"{stem}.color.png", folder),
+            _parse_pose(read_text(path_inside(folder, file.name, folder), MAX_POSE_BYTES), file, "the pose"),
+            path_inside(folder, f"{stem}.depth.png", folder),
         )
         for file, stem in zip(files, stems, strict=True)
     )

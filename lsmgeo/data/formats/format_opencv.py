@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import re
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from lsmgeo.data.files import child, refuse_unreadable
 from lsmgeo.data.formats.lenses import Lens
 from lsmgeo.data.formats.opencv_storage import is_storage, parse_storage
+from lsmgeo.data.formats.scene_assembly import MAX_SIDE, check_intrinsics, check_rotation
 from lsmgeo.data.images import SUFFIXES
-from lsmgeo.data.isolated import isolated
-from lsmgeo.data.posed import MAX_SIDE, check_intrinsics, check_rotation
+from lsmgeo.data.isolated import parse_isolated
+from lsmgeo.data.read_files import file_reader, path_inside
 from lsmgeo.errors import DataError
 
 if TYPE_CHECKING:
@@ -45,8 +46,8 @@ class CalibratedLens:
         kind: "perspective" or "fisheye", as in `Lens`.
         intrinsics: (3, 3) float64, integer pixel centres.
         coefficients: of the distortion, as in `Lens`; zeros where none are stated.
-        size: (height, width) of its pictures, None where it is not stated.
-        views: (N, 6) poses of the board in N pictures, board-to-camera: rotation vector (radians), then translation
+        size: (height, width) of its images, None where it is not stated.
+        views: (N, 6) poses of the board in N images, board-to-camera: rotation vector (radians), then translation
             (units of the square's size); None where they are not stated.
         file: what states it.
     """
@@ -59,7 +60,7 @@ class CalibratedLens:
     file: Path
 
     def sized(self, height: int, width: int) -> Lens:
-        """The lens for pictures of this size."""
+        """The lens for images of this size."""
         return Lens(self.kind, self.intrinsics, self.coefficients, height, width)
 
 
@@ -97,7 +98,7 @@ class Calibration:
         lenses: by name: "first" and "second" of a rig, otherwise the name of the file, without its ending.
         rig: how the second camera stands to the first, where that is stated.
         board: the chessboard, where its corners are stated.
-        pictures: files of the board's pictures, one tuple a camera: two of equal length whose pictures were taken at
+        images: files of the board's images, one tuple a camera: two of equal length whose images were taken at
             once, or one, or none.
         source: the name of the format.
     """
@@ -105,8 +106,14 @@ class Calibration:
     lenses: dict[str, CalibratedLens]
     rig: Rig | None = None
     board: Board | None = None
-    pictures: tuple[tuple[Path, ...], ...] = field(default=())
+    images: tuple[tuple[Path, ...], ...] = field(default=())
     source: str = "opencv"
+
+    @property
+    def pictures(self) -> tuple[tuple[Path, ...], ...]:
+        """The old name of `images`, for this version."""
+        warnings.warn("Calibration.pictures is now Calibration.images", DeprecationWarning, stacklevel=2)
+        return self.images
 
 
 def calibration_files(folder: Path) -> list[Path]:
@@ -119,18 +126,18 @@ def is_calibration(path: Path) -> bool:
     return bool(calibration_files(path)) if path.is_dir() else is_storage(path)
 
 
-@refuse_unreadable
+@file_reader
 def read_calibration(path: str | Path) -> Calibration:
     """Read calibrations that OpenCV's FileStorage wrote as YAML, XML or JSON.
 
     Known are the names of OpenCV's samples: ``camera_matrix`` and ``distortion_coefficients`` with ``image_width``,
     ``image_height``, ``board_width``, ``board_height``, ``square_size`` and ``extrinsic_parameters``; ``M1 D1 M2 D2``,
     ``K1 D1 K2 D2`` or ``cameraMatrix1 distCoeffs1`` and so on, with ``R T``, of a rig; ``fisheye_model``; and one list
-    of pictures.
+    of images.
     (https://docs.opencv.org, tutorial "Camera calibration With OpenCV" and samples calibration and stereo_calib.)
 
-    All files of a folder are taken together, as a rig's lenses, its R and T and the list of its pictures usually lie in
-    three; nothing may be stated twice. Pictures of a list that are not there are left out, with their partner. A JSON
+    All files of a folder are taken together, as a rig's lenses, its R and T and the list of its images usually lie in
+    three; nothing may be stated twice. Images of a list that are not there are left out, with their partner. A JSON
     file is looked at where it holds a matrix of OpenCV's.
 
     Convention:
@@ -140,11 +147,11 @@ def read_calibration(path: str | Path) -> Calibration:
         path: a file, or a folder of them.
 
     Returns:
-        Lenses, rig, board and pictures, as far as they are stated.
+        Lenses, rig, board and images, as far as they are stated.
 
     Raises:
         DataError: a file is damaged or too large, crashes its parser, states what is no lens or no rotation, or names
-            a picture outside its folder; two files state the same; or there is nothing to be used.
+            an image outside its folder; two files state the same; or there is nothing to be used.
 
     Example:
         >>> from lsmgeo import data
@@ -157,7 +164,7 @@ def read_calibration(path: str | Path) -> Calibration:
     lenses: dict[str, CalibratedLens] = {}
     rig = board = None
     lists: list[tuple[Path, tuple[str, ...]]] = []
-    for file, entries in zip(files, read_storages(files), strict=True):
+    for file, entries in zip(files, read_storage_files(files), strict=True):
         if isinstance(entries, DataError):
             raise entries
         for name, lens in _lenses(entries, file):
@@ -172,23 +179,23 @@ def read_calibration(path: str | Path) -> Calibration:
             if board is not None and board.corners != seen.corners:
                 raise DataError(file, f"states a board of {seen.corners} corners, another file {board.corners}")
             board = seen
-        lists += [(file, names) for names in entries.texts.values() if _are_pictures(names)]
+        lists += [(file, names) for names in entries.texts.values() if _are_images(names)]
     if len(lists) > 1:
-        raise DataError(lists[1][0], f"lists pictures, and so does {lists[0][0].name}; name one file")
-    pictures = _pictures(*lists[0]) if lists else ()
-    if not lenses and rig is None and not pictures:
-        raise DataError(path, "states no camera matrix, no R and T, and lists no picture")
-    return Calibration(lenses, rig, board, pictures)
+        raise DataError(lists[1][0], f"lists images, and so does {lists[0][0].name}; name one file")
+    images = _images(*lists[0]) if lists else ()
+    if not lenses and rig is None and not images:
+        raise DataError(path, "states no camera matrix, no R and T, and lists no image")
+    return Calibration(lenses, rig, board, images)
 
 
-def read_storages(paths: Sequence[Path]) -> list[Entries | DataError]:
+def read_storage_files(paths: Sequence[Path]) -> list[Entries | DataError]:
     """Read numbers, texts, lists of texts and matrices from the top of FileStorage files.
 
     Returns:
         For each file what it states, or the error of one that cannot be used. Matrices are float64.
     """
     results: list[Entries | DataError] = []
-    found = isolated(parse_storage, paths, limit=MAX_STORAGE_BYTES, memory=MEMORY, seconds=SECONDS)
+    found = parse_isolated(parse_storage, paths, limit=MAX_STORAGE_BYTES, memory=MEMORY, seconds=SECONDS)
     for path, arrays in zip(paths, found, strict=True):
         if isinstance(arrays, DataError):
             results.append(arrays)
@@ -279,14 +286,14 @@ def _rig(entries: Entries, file: Path) -> Rig | None:
     return Rig(rotation, translation.ravel(), file)
 
 
-def _are_pictures(names: tuple[str, ...]) -> bool:
+def _are_images(names: tuple[str, ...]) -> bool:
     return bool(names) and all(name.lower().endswith(SUFFIXES) for name in names)
 
 
-def _pictures(file: Path, names: tuple[str, ...]) -> tuple[tuple[Path, ...], ...]:
+def _images(file: Path, names: tuple[str, ...]) -> tuple[tuple[Path, ...], ...]:
     if len(set(names)) != len(names):
-        raise DataError(file, "lists a picture twice")
-    paths = [child(file.parent, name, file) for name in names]
+        raise DataError(file, "lists an image twice")
+    paths = [path_inside(file.parent, name, file) for name in names]
     # Two cameras where names apart from their digits alternate, as left01.jpg, right01.jpg, left02.jpg do.
     kinds = [re.sub(r"\d", "", name) for name in names]
     if len(names) % 2 == 0 and set(kinds[0::2]) != set(kinds[1::2]) and len(set(kinds)) == 2:

@@ -1,0 +1,190 @@
+"""What every reader of posed images needs: checks of the stated cameras, and `assemble`, which makes the scene."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from lsmgeo.cameras import from_opencv
+from lsmgeo.data.posed_images import PosedImages
+from lsmgeo.errors import DataError, LsmGeoError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    import numpy.typing as npt
+
+    from lsmgeo.cameras import CameraTensors
+    from lsmgeo.data.formats.depth_files import DepthFile
+    from lsmgeo.data.formats.lenses import Lens
+    from lsmgeo.data.posed_images import SparsePoints, Voxels
+
+__all__ = [
+    "assemble",
+    "camera_errors_as_data_errors",
+    "check_camera",
+    "check_image_size",
+    "check_intrinsics",
+    "check_last_row",
+    "check_rotation",
+    "make_cameras",
+]
+
+# An image server's largest images have such sides; what is beyond is a damaged number.
+MAX_SIDE = 1 << 17
+MAX_PARAMETER = 1e7
+
+
+@contextlib.contextmanager
+def camera_errors_as_data_errors(file: Path) -> Iterator[None]:
+    """Turn what the library says of cameras into an error of the file that states them."""
+    try:
+        yield
+    except DataError:
+        raise
+    except LsmGeoError as error:
+        raise DataError(file, str(error)) from error
+
+
+def check_intrinsics(intrinsics: np.ndarray, file: Path, where: str) -> None:
+    """Check K, (3, 3).
+
+    Raises:
+        DataError: not upper triangular with positive focal lengths and the last row 0 0 1, or beyond 1e7 pixels.
+    """
+    lower = intrinsics[[1, 2, 2], [0, 0, 1]]
+    if np.abs(lower).max() > 1e-9 or abs(intrinsics[2, 2] - 1) > 1e-9 or min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
+        raise DataError(file, f"{where}: K must be upper triangular with positive focal lengths and last row 0 0 1")
+    if np.abs(intrinsics).max() > MAX_PARAMETER:
+        raise DataError(file, f"{where}: K holds a number beyond {MAX_PARAMETER:g} pixels")
+
+
+def check_rotation(rotation: np.ndarray, file: Path, where: str) -> None:
+    """Check a rotation, (3, 3), as far as single precision and rounded decimals leave it one.
+
+    Raises:
+        DataError: it is scaled, mirrored, or no rotation at all; the reason says which.
+    """
+    # In units of its own size, which is 1 for a rotation: numbers in a file may be large enough to overflow.
+    size = float(np.abs(rotation).max())
+    unit = rotation / size if size > 0 else rotation
+    scale = size * float(np.sqrt((unit * unit).sum() / 3))
+    unit = rotation / scale if scale > 0 else rotation
+    rigid = scale > 0 and np.abs(unit.T @ unit - np.eye(3)).max() <= 1e-3
+    if not rigid:
+        raise DataError(file, f"{where}: the rotation is none: its columns are not perpendicular and of one length")
+    if np.linalg.det(unit) < 0:
+        raise DataError(
+            file, f"{where}: the rotation is mirrored (determinant -1): an axis is flipped or two exchanged"
+        )
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3:
+        raise DataError(file, f"{where}: the rotation is scaled by {scale:.6g}; divide it by that")
+
+
+def check_camera(intrinsics: np.ndarray, rotation: np.ndarray, file: Path, where: str) -> None:
+    """Check K and a rotation, (3, 3) each, see `check_intrinsics` and `check_rotation`."""
+    check_intrinsics(intrinsics, file, where)
+    check_rotation(rotation, file, where)
+
+
+def check_last_row(pose: np.ndarray, file: Path, what: str) -> None:
+    """Check that the last row of a pose, (4, 4), is 0 0 0 1.
+
+    Raises:
+        DataError: it is another one.
+    """
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise DataError(file, f"{what} must have the last row 0 0 0 1")
+
+
+def check_image_size(stated: tuple[float, float], found: tuple[int, int], image: Path, file: Path, where: str) -> None:
+    """Compare the (height, width) that a camera is made for with that of its image.
+
+    Raises:
+        DataError: they differ, so that K belongs to another resolution.
+    """
+    if stated != found:
+        raise DataError(
+            file,
+            f"{where}: the camera is of {stated[1]:g} x {stated[0]:g} pixels and {image.name!r} has "
+            f"{found[1]} x {found[0]} (width x height): K of another resolution (lsmgeo.cameras.resize makes K follow)",
+        )
+
+
+def make_cameras(
+    intrinsics: npt.ArrayLike,
+    rotations: npt.ArrayLike,
+    translations: npt.ArrayLike,
+    sizes: Sequence[tuple[int, int]],
+    file: Path,
+    *,
+    pixel_center: str = "integer",
+) -> CameraTensors:
+    """Make cameras (V,) of K (V, 3, 3), world-to-camera R (V, 3, 3) and t (V, 3), and (height, width) of each image.
+
+    Raises:
+        DataError: one of them is no camera; ``file`` states it.
+    """
+    K, R, t = (torch.from_numpy(np.array(part, np.float64)) for part in (intrinsics, rotations, translations))
+    height, width = torch.tensor(sizes).unbind(-1)
+    with camera_errors_as_data_errors(file):
+        return from_opencv(K, R, t, height, width, pixel_center=pixel_center)
+
+
+def assemble(
+    names: Sequence[str],
+    paths: Sequence[Path],
+    cameras: CameraTensors,
+    source: str,
+    *,
+    file: Path,
+    lenses: Sequence[Lens | None] = (),
+    points: SparsePoints | None = None,
+    depths: Sequence[DepthFile | None] = (),
+    cut_out: bool = False,
+    voxels: Voxels | None = None,
+    category: str | None = None,
+) -> PosedImages:
+    """Make a scene of what a reader has found; images with a lens get the camera of what it straightens them to.
+
+    Args:
+        names: one an image, none twice.
+        paths: their files.
+        cameras: leading shape (V,), with K as each image was taken.
+        source: the format's name.
+        file: what stated the cameras, for errors.
+        lenses: one an image, or nothing.
+        points: sparse points, their observations in straightened pixels.
+        depths: one an image, or nothing.
+        cut_out: as in `PosedImages`.
+        voxels: as in `PosedImages`.
+        category: as in `PosedImages`.
+
+    Raises:
+        DataError: a name is given twice, or a lens cannot be straightened.
+    """
+    if len(set(names)) != len(names):
+        raise DataError(file, "names an image twice")
+    bent = [lens is not None for lens in lenses]
+    if any(bent):
+        K = list(cameras.intrinsics)
+        with camera_errors_as_data_errors(file):
+            for view, lens in enumerate(lenses):
+                K[view] = K[view] if lens is None else torch.from_numpy(lens.pinhole)
+        cameras = cameras._replace(intrinsics=torch.stack(K))
+    return PosedImages(
+        tuple(names),
+        tuple(paths),
+        cameras,
+        points,
+        source,
+        lenses=tuple(lenses) if any(bent) else None,
+        depths=tuple(depths) if any(depth is not None for depth in depths) else None,
+        cut_out=cut_out,
+        voxels=voxels,
+        category=category,
+    )

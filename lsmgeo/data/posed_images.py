@@ -1,0 +1,222 @@
+"""Images with known cameras, and the points, depth and voxels that come with them: what every reader returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+from lsmgeo._checks import describe, is_whole
+from lsmgeo.data.images import read_cut_out, read_image
+from lsmgeo.data.sample import Sample
+from lsmgeo.errors import DataError, OptionError, ShapeError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from lsmgeo.cameras import CameraTensors
+    from lsmgeo.data.formats.depth_files import DepthFile
+    from lsmgeo.data.formats.lenses import Lens
+    from lsmgeo.grids import VoxelGrid
+
+__all__ = ["Observations", "PosedImages", "SparsePoints", "Voxels"]
+
+
+class Observations(NamedTuple):
+    """Where one image sees sparse points.
+
+    Convention:
+        Pixels are integer-centred: (0, 0) is the centre of the top-left pixel.
+    """
+
+    points: np.ndarray  # (M,) int64, rows of SparsePoints.positions
+    pixels: np.ndarray  # (M, 2) float64, x then y
+
+
+class SparsePoints(NamedTuple):
+    """Sparse points of a reconstruction, and who observes them."""
+
+    positions: np.ndarray  # (N, 3) float64, world
+    colours: np.ndarray  # (N, 3) uint8, RGB
+    observations: tuple[Observations, ...]  # one per image
+
+
+class Voxels(NamedTuple):
+    """The solid that the images show, as voxels, and where in their world these lie."""
+
+    occupancy: torch.Tensor  # (D, H, W) bool
+    grid: VoxelGrid
+
+    @property
+    def world_from_lattice(self) -> np.ndarray:
+        """(4, 4) float64, from voxel index (x, y, z) to world."""
+        return self.grid.world_from_lattice.double().reshape(-1, 4, 4)[0].numpy()
+
+    @property
+    def voxel_size(self) -> float:
+        """Side of a cube with the volume of one voxel, in world units."""
+        return float(np.cbrt(abs(np.linalg.det(self.world_from_lattice[:3, :3]))))
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImages:
+    """V images with known cameras; they may be of different sizes.
+
+    Convention:
+        Cameras are world-to-camera, OpenCV axes, integer pixel centres, float64, whatever the source's convention.
+        They belong to what :meth:`load` gives: images taken through a lens with distortion are straightened.
+
+    Attributes:
+        names: the names that the source gives to the images.
+        paths: their files, all inside the scene's folder.
+        cameras: :class:`lsmgeo.cameras.CameraTensors` with leading shape (V,).
+        points: sparse points where the source has them.
+        source: the name of the format, as `lsmgeo.data.detect` gives it.
+        lenses: the lens of each image, None for one that is straight; None where all are.
+        depths: the depth of each image, None for one without; None where no image has any.
+        voxels: the solid that is seen, where the source has it.
+        cut_out: whether the images' alpha is the outline of the object, which :meth:`load` puts before white.
+        category: the category of the object, where the source names one.
+    """
+
+    names: tuple[str, ...]
+    paths: tuple[Path, ...]
+    cameras: CameraTensors
+    points: SparsePoints | None
+    source: str
+    lenses: tuple[Lens | None, ...] | None = None
+    depths: tuple[DepthFile | None, ...] | None = None
+    voxels: Voxels | None = None
+    cut_out: bool = False
+    category: str | None = None
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __repr__(self) -> str:
+        """How many of which sizes, and what came with them."""
+        sizes = list(dict.fromkeys(self.size(view) for view in range(len(self))))
+        size = f"{sizes[0][1]} x {sizes[0][0]}" if len(sizes) == 1 else f"{len(sizes)} sizes"
+        beside = [name for name in ("points", "lenses", "depths", "voxels") if getattr(self, name) is not None]
+        return f"<PosedImages: {len(self)} x {size}, {', '.join((self.source, *beside))}>"
+
+    def camera(self, view: int) -> CameraTensors:
+        """The camera of one view, leading shape ()."""
+        return type(self.cameras)(*(torch.as_tensor(value)[view] for value in self.cameras))
+
+    def size(self, view: int) -> tuple[int, int]:
+        """(height, width) of one image in pixels."""
+        height, width = (int(torch.as_tensor(size)[view]) for size in self.cameras[2:])
+        return height, width
+
+    def load(self, view: int) -> torch.Tensor:
+        """Read one image, straightened, before white where it is cut out.
+
+        Returns:
+            (3, H, W) float32 in [0, 1], RGB.
+
+        Raises:
+            DataError: the file is missing, damaged, or not of its camera's size.
+        """
+        if self.cut_out:
+            pixels = self._straight(view, read_cut_out(self.paths[view], self.size(view)))
+            alpha = pixels[..., 3:].astype(np.float32) / 255
+            mixed = pixels[..., :3] * alpha + 255 * (1 - alpha)
+            return torch.from_numpy(mixed).permute(2, 0, 1).div_(255)
+        pixels = self._straight(view, read_image(self.paths[view], self.size(view)))
+        # In place: an image of many megapixels is not held twice as floats.
+        return torch.from_numpy(pixels).permute(2, 0, 1).to(torch.float32).div_(255)
+
+    def load_mask(self, view: int) -> torch.Tensor | None:
+        """Read the outline of the object in one image: where alpha is at least one half.
+
+        Returns:
+            (H, W) bool, or None where images are not cut out.
+
+        Raises:
+            DataError: as :meth:`load`.
+        """
+        if not self.cut_out:
+            return None
+        pixels = self._straight(view, read_cut_out(self.paths[view], self.size(view)))
+        return torch.from_numpy(pixels[..., 3] >= 128)
+
+    def load_depth(self, view: int) -> torch.Tensor | None:
+        """Read the depth of one image.
+
+        Returns:
+            (H, W) float32 camera z in world units, 0 where there is none; None where this image has no depth.
+
+        Raises:
+            DataError: the file is missing, damaged, or not of its camera's size.
+        """
+        file = None if self.depths is None else self.depths[view]
+        if file is None:
+            return None
+        return torch.from_numpy(self._straight(view, file.read(self.size(view)), nearest=True))
+
+    def _straight(self, view: int, image: np.ndarray, *, nearest: bool = False) -> np.ndarray:
+        lens = None if self.lenses is None else self.lenses[view]
+        return image if lens is None else lens.straighten(image, nearest=nearest)
+
+    def sample(self, views: Sequence[int] | None = None) -> Sample:
+        """Read images as the sample that models are fed, named after their folder.
+
+        Where there are voxels, the world is moved and scaled so that they fill [-0.5, 0.5]^3, as a sample promises.
+
+        Args:
+            views: which, and in which order; None for all. They must be of one size: resize or crop others first
+                (`lsmgeo.cameras.resize`, `lsmgeo.cameras.crop` do the cameras' part).
+
+        Returns:
+            Images and cameras (float64); depth where all the images have it, mask and occupancy where the source
+            has them; no mesh.
+
+        Raises:
+            OptionError: no view, or one that does not exist.
+            ShapeError: two images of different sizes.
+            DataError: a file is missing, damaged, or not of its camera's size; or the voxels fill no cube.
+        """
+        chosen = list(range(len(self)) if views is None else views)
+        if not chosen or not all(is_whole(view) and 0 <= view < len(self) for view in chosen):
+            raise OptionError(f"sample: views must be numbers from 0 to {len(self) - 1}; got {describe(views)}")
+        # All sizes before the first image: they are large.
+        sizes = {self.size(view): self.names[view] for view in chosen}
+        if len(sizes) > 1:
+            (first, name), (second, other) = list(sizes.items())[:2]
+            raise ShapeError(
+                "sample: images must be of one size; "
+                f"{name!r} is {first[0]} x {first[1]} (height x width), {other!r} {second[0]} x {second[1]}: "
+                "choose views of one size, or load them one by one"
+            )
+        images = torch.stack([self.load(view) for view in chosen])
+        cameras = type(self.cameras)(*(torch.as_tensor(value)[chosen] for value in self.cameras))
+        maps = [depth for view in chosen if (depth := self.load_depth(view)) is not None]
+        depth = torch.stack(maps) if len(maps) == len(chosen) else None
+        masks = [mask for view in chosen if (mask := self.load_mask(view)) is not None]
+        occupancy = None
+        if self.voxels is not None:
+            occupancy = self.voxels.occupancy
+            unit, middle = self._cube(self.voxels.grid)
+            # X = unit X' + middle, and the camera's own coordinates shrink alike, so that its rotation stays one.
+            E = cameras.cam_from_world.clone()
+            E[:, :3, 3] = (E[:, :3, 3] + (E[:, :3, :3] * middle).sum(-1)) / unit
+            cameras = cameras._replace(cam_from_world=E)
+            depth = None if depth is None else depth / unit
+        folder = self.paths[chosen[0]].parent
+        name = folder.parent.name if folder.name in ("images", "rendering") else folder.name
+        mask = torch.stack(masks) if masks else None
+        return Sample(images, cameras, depth, mask, occupancy, None, self.category, name or self.source)
+
+    def _cube(self, grid: VoxelGrid) -> tuple[float, torch.Tensor]:
+        """The side and the middle of the cube that the voxels fill."""
+        index = torch.tensor(grid.shape, dtype=torch.float64)
+        T = grid.world_from_lattice.double()
+        sides = T[:3, :3].diagonal() * index.flip(0)
+        straight = bool(((T[:3, :3] - T[:3, :3].diagonal().diag()).abs() <= 1e-9 * sides.abs().max()).all())
+        if not straight or not bool((sides - sides[0]).abs().max() <= 1e-6 * sides[0]):
+            raise DataError(self.paths[0].parent, "its voxels fill no cube along the axes, which a sample needs")
+        return float(sides[0]), T[:3, 3] + T[:3, :3].diagonal() * (index.flip(0) - 1) / 2

@@ -104,4 +104,4 @@ def _with_views(calibration: Calibration, change: Callable[[np.ndarray], np.ndar
 def _shuffled_pairs(calibration: Calibration) -> Calibration:
     """The second camera's pictures in another order."""
     first, second = calibration.images
-    return replace(calibration, pictures=(first, tuple(second[index] for index in _another(len(second)))))
+    return replace(calibration, images=(first, tuple(second[index] for index in _another(len(second)))))

@@ -143,7 +143,7 @@ def test_k_of_another_resolution_is_named(truth, scale):
 @pytest.mark.parametrize("order", [(1, 2, 3, 4, 5, 6, 0), (1, 0, 2, 3, 4, 5, 6), (6, 5, 4, 3, 2, 1, 0)])
 def test_shuffled_frames_are_named_and_paired(truth, order):
     first, second = truth.images
-    findings = examine_calibration(replace(truth, pictures=(first, tuple(second[index] for index in order))), HERE)
+    findings = examine_calibration(replace(truth, images=(first, tuple(second[index] for index in order))), HERE)
     assert findings.verdict == "bad"
     assert findings.cause.name == "frames shuffled"
     assert values(findings)["rms of a stereo calibration from scratch"] > 1
@@ -211,11 +211,11 @@ def test_stated_poses_of_the_board_are_compared(truth):
 
 
 def test_what_cannot_be_measured_is_unknown(truth, tmp_path):
-    findings = examine_calibration(replace(truth, pictures=()), HERE)
+    findings = examine_calibration(replace(truth, images=()), HERE)
     assert (findings.verdict, findings.checks) == ("unknown", ())
     assert "names no picture of a board" in findings.gap.reason
     Image.new("RGB", (320, 240)).save(tmp_path / "a.png")
-    findings = examine_calibration(replace(truth, pictures=((tmp_path / "a.png",),)), HERE)
+    findings = examine_calibration(replace(truth, images=((tmp_path / "a.png",),)), HERE)
     assert findings.verdict == "unknown"
     assert findings.gap.reason == "no board was found in 1 picture of the camera"
     few = replace(truth, images=tuple(side[:2] for side in truth.images))

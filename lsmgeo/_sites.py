@@ -13,8 +13,15 @@ from torch import Tensor
 from lsmgeo._checks import check_devices, check_float, check_mask, check_size, describe
 from lsmgeo._linalg import affine_inverse, multiply
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
-from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, check_cameras, image_sizes
-from lsmgeo.cameras.transforms import common_size
+from lsmgeo.cameras.tensors import (
+    Cameras,
+    CameraTensors,
+    as_tensors,
+    check_cameras,
+    common_size,
+    views_of,
+    views_per_scene,
+)
 from lsmgeo.errors import DTypeError, ShapeError
 from lsmgeo.grids import FrustumGrid, Lattice, VoxelGrid, check_depths
 from lsmgeo.kernels.request import Options, Sites
@@ -43,18 +50,10 @@ def _views(
     who: str, cameras: CameraTensors, views: tuple[int, int], view_mask: Tensor | None, **tensors: Tensor
 ) -> CameraTensors:
     """Bring cameras to leading shape (B, V) and check them."""
-    leading = tuple(cameras.cam_from_world.shape[:-2])
-    if leading != views and leading != (views[0] * views[1],):
-        raise ShapeError(
-            f"{who}: cameras must have leading shape (B, V) = {views}, or (B*V,) with the view fastest; got {leading}"
-        )
+    cameras = views_of(who, cameras, views)
     if view_mask is not None:
         check_mask(who, "view_mask", view_mask, views, "(B, V)")
     check_devices(who, **tensors, cameras=cameras.intrinsics, view_mask=view_mask)
-    if leading != views:
-        height, width = (size.reshape(views) for size in image_sizes(cameras))
-        K, E = cameras.intrinsics.reshape(*views, 3, 3), cameras.cam_from_world.reshape(*views, 4, 4)
-        cameras = CameraTensors(K, E, height, width)
     check_cameras(who, cameras, view_mask)
     return cameras
 
@@ -127,22 +126,7 @@ def sweep_sites(
             f"{who}: volume must be (B, C, D, H, W) with the grid's (D, H, W) = {grid.shape}; got {tuple(volume.shape)}"
         )
     tensors = as_tensors(cameras, who)
-    count, scenes = prod(tensors.cam_from_world.shape[:-2]), volume.shape[0]
-    leading = tensors.cam_from_world.shape[:-2]
-    if len(leading) == 2:
-        views = (leading[0], leading[1])
-        if leading[0] != scenes:
-            raise ShapeError(f"{who}: cameras must be (B, V) with the volume's B = {scenes}; got {tuple(leading)}")
-    else:
-        # With no scene the number of views cannot be told, and 1 is as good as any.
-        if scenes == 0 and count == 0:
-            views = (0, 1)
-        elif scenes == 0 or count % scenes:
-            raise ShapeError(f"{who}: cameras must be B*V with the volume's B = {scenes}; got {count}")
-        else:
-            views = (scenes, count // scenes)
-    if views[1] < 1:
-        raise ShapeError(f"{who}: cameras must hold at least one view a scene; got none")
+    views = views_per_scene(who, tensors, volume.shape[0], "volume's")
     lattice = _lattice(who, grid, volume)
     tensors = _views(who, tensors, views, view_mask, volume=volume)
     check_depths(who, depths, "(P,), (B, P) or (B, V, P)", view_mask)

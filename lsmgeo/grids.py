@@ -27,8 +27,7 @@ from lsmgeo._checks import (
 )
 from lsmgeo._linalg import affine_inverse, basis_row, homogeneous_row, inverse_3x3, multiply
 from lsmgeo.cameras.matrices import camera_matrices
-from lsmgeo.cameras.tensors import Cameras, as_tensors, check_cameras
-from lsmgeo.cameras.transforms import common_size
+from lsmgeo.cameras.tensors import Cameras, as_tensors, check_cameras, common_size
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import DTypeError, GridError, ShapeError
 

@@ -14,12 +14,14 @@ from lsmgeo.cameras.converters import (
     to_opengl,
     to_pytorch3d,
 )
+from lsmgeo.cameras.projection import centers, project, rays, unproject_depth
 from lsmgeo.cameras.tensors import CameraTensors, as_tensors, select, stack, to
-from lsmgeo.cameras.transforms import crop, look_at, orbit, perturb, rays, resize
+from lsmgeo.cameras.transforms import crop, look_at, orbit, perturb, resize
 
 __all__ = [
     "CameraTensors",
     "as_tensors",
+    "centers",
     "crop",
     "from_colmap",
     "from_opencv",
@@ -28,6 +30,7 @@ __all__ = [
     "look_at",
     "orbit",
     "perturb",
+    "project",
     "rays",
     "resize",
     "select",
@@ -37,4 +40,5 @@ __all__ = [
     "to_opencv",
     "to_opengl",
     "to_pytorch3d",
+    "unproject_depth",
 ]

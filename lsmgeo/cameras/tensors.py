@@ -1,20 +1,33 @@
-"""`CameraTensors`, the plain form of any number of pinhole cameras, and what turns kornia's classes into it."""
+"""`CameraTensors`, the plain form of any number of pinhole cameras, and the checks of cameras."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from math import prod
 from typing import Any, NamedTuple
 
 import torch
-from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from lsmgeo._checks import GEOMETRY, LARGEST_COUNT, check_devices, check_geometry, describe, is_whole
 from lsmgeo._linalg import multiply
+from lsmgeo.cameras.kornia_types import PinholeCamera, from_fields, to_fields
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, DTypeError, ShapeError
 
-__all__ = ["CameraTensors", "Cameras", "as_tensors", "check_cameras", "image_sizes", "select", "stack", "to"]
+__all__ = [
+    "CameraTensors",
+    "Cameras",
+    "as_tensors",
+    "check_cameras",
+    "common_size",
+    "image_sizes",
+    "select",
+    "stack",
+    "to",
+    "views_of",
+    "views_per_scene",
+]
 
 
 class CameraTensors(NamedTuple):
@@ -32,7 +45,8 @@ class CameraTensors(NamedTuple):
         width: (...) image widths in pixels, likewise.
 
     The leading shape is (B, V) where an operator takes V views of B scenes (or (B*V,), view fastest), and (B,) or ()
-    where one camera a scene is meant.
+    where one camera a scene is meant. This is a tuple of four fields: ``cameras[0]`` is the intrinsics of all cameras,
+    and ``cameras.at(0)`` the first camera.
 
     Example:
         >>> import torch
@@ -40,12 +54,64 @@ class CameraTensors(NamedTuple):
         >>> cameras = CameraTensors(torch.eye(3).expand(2, 4, 3, 3), torch.eye(4).expand(2, 4, 4, 4), 48, 64)
         >>> cameras.to_kornia().batch_size
         8
+        >>> cameras.at((slice(None), 0)).shape  # the first view of each scene
+        (2,)
     """
 
     intrinsics: Tensor
     cam_from_world: Tensor
     height: Tensor | int
     width: Tensor | int
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The leading shape: (B, V), (V,), ()."""
+        return tuple(self.cam_from_world.shape[:-2])
+
+    @property
+    def device(self) -> torch.device:
+        """Where the matrices are."""
+        return self.cam_from_world.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """That of the matrices."""
+        return self.cam_from_world.dtype
+
+    def at(self, index: Any) -> CameraTensors:
+        """Some of the cameras: `index` applies to the leading shape, as an index of a tensor of that shape does.
+
+        Args:
+            index: an int, a slice, a tensor or list of integers or booleans, ``None`` for a new axis, or a tuple of
+                such: of (B, V) cameras ``(slice(None), 0)`` is the first view of each scene.
+
+        Returns:
+            `CameraTensors`; sizes that are ints stay as they are.
+
+        Raises:
+            ShapeError: the leading shape has no such cameras.
+        """
+        cameras = as_tensors(self, "CameraTensors.at")
+        places = index if isinstance(index, tuple) else (index,)
+        rows = (*places, slice(None), slice(None))
+        try:
+            chosen = [size[places] for size in image_sizes(cameras)]
+        except (IndexError, TypeError, ValueError, OverflowError) as error:
+            raise ShapeError(
+                f"CameraTensors.at: index must fit the leading shape {self.shape}; got {describe(index)}"
+            ) from error
+        height, width = (old if is_whole(old) else new for old, new in zip(self[2:], chosen, strict=True))
+        return CameraTensors(cameras.intrinsics[rows], cameras.cam_from_world[rows], height, width)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> CameraTensors:
+        """The cameras with `function` applied to intrinsics and cam_from_world; the sizes stay."""
+        return self._replace(intrinsics=function(self.intrinsics), cam_from_world=function(self.cam_from_world))
+
+    def to(
+        self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None
+    ) -> CameraTensors:
+        """The cameras on a device, in a dtype (which may come first too) or both; see `lsmgeo.cameras.to`."""
+        return to(self, device, dtype)
 
     @classmethod
     def from_kornia(cls, camera: PinholeCamera) -> CameraTensors:
@@ -55,15 +121,27 @@ class CameraTensors(NamedTuple):
     def to_kornia(self) -> PinholeCamera:
         """The same cameras as one kornia ``PinholeCamera``, leading axes flattened (view fastest)."""
         cameras = as_tensors(self)
-        corner = cameras.intrinsics.new_tensor([0.0, 0.0, 0.0, 1.0])
-        intrinsics = torch.cat((cameras.intrinsics, torch.zeros_like(cameras.intrinsics[..., :1])), -1)
-        intrinsics = torch.cat((intrinsics, corner.expand(*intrinsics.shape[:-2], 1, 4)), -2)
-        return PinholeCamera(
-            intrinsics.reshape(-1, 4, 4),
-            cameras.cam_from_world.reshape(-1, 4, 4),
-            *(size.reshape(-1) for size in image_sizes(cameras)),
-        )
+        return from_fields(cameras.intrinsics, cameras.cam_from_world, *image_sizes(cameras))
 
+
+def _field(cameras: CameraTensors, index: Any) -> Any:
+    try:
+        return tuple.__getitem__(cameras, index)
+    except (IndexError, TypeError) as error:
+        fields = ", ".join(CameraTensors._fields)
+        raise type(error)(f"cameras[{index}]: the fields are {fields}; a view is cameras.at({index})") from None
+
+
+def _no_field(cameras: CameraTensors, name: str) -> Any:
+    raise AttributeError(
+        f"CameraTensors has no {name!r}; it has {', '.join(CameraTensors._fields)}, shape, device, dtype, at, map, to "
+        "and to_kornia, and lsmgeo.cameras has functions of cameras"
+    )
+
+
+# Set here, not defined above: type checkers would take every name and index for one that exists.
+CameraTensors.__getitem__ = _field  # type: ignore[method-assign, assignment]
+CameraTensors.__getattr__ = _no_field  # type: ignore[attr-defined]
 
 Cameras = PinholeCamera | CameraTensors
 
@@ -85,7 +163,7 @@ def as_tensors(cameras: Cameras, who: str = "cameras") -> CameraTensors:
         DeviceError: tensors on different devices.
     """
     if isinstance(cameras, PinholeCamera):
-        cameras = CameraTensors(cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
+        cameras = CameraTensors(*to_fields(cameras))
     elif not isinstance(cameras, CameraTensors):
         raise DTypeError(
             f"{who}: cameras must be a kornia PinholeCamera, a PinholeCamerasList or lsmgeo.cameras.CameraTensors; "
@@ -124,6 +202,55 @@ def image_sizes(cameras: CameraTensors) -> tuple[Tensor, Tensor]:
     assert isinstance(height, Tensor)
     assert isinstance(width, Tensor)
     return height, width
+
+
+def common_size(who: str, cameras: CameraTensors) -> tuple[int, int]:
+    """The one image size (height, width) of all cameras; an error where they differ or where values cannot be read."""
+    if torch.compiler.is_compiling():
+        raise CameraError(f"{who}: size must be given under torch.compile and torch.export; got None")
+    heights, widths = (size.unique().tolist() for size in image_sizes(cameras))
+    if len(heights) != 1 or len(widths) != 1:
+        raise CameraError(
+            f"{who}: size must be given where views differ in size; got heights {heights}, widths {widths}"
+        )
+    if heights[0] != int(heights[0]) or widths[0] != int(widths[0]):
+        raise CameraError(f"{who}: size must be given where the cameras' is fractional; got {heights[0]} x {widths[0]}")
+    return int(heights[0]), int(widths[0])
+
+
+def views_per_scene(who: str, cameras: CameraTensors, scenes: int, whose: str) -> tuple[int, int]:
+    """(B, V) of cameras (B, V) or (B*V,) beside B scenes of another argument, which `whose` names in errors."""
+    leading = cameras.shape
+    if len(leading) == 2:
+        views = (leading[0], leading[1])
+        if leading[0] != scenes:
+            raise ShapeError(f"{who}: cameras must be (B, V) with the {whose} B = {scenes}; got {leading}")
+    else:
+        count = prod(leading)
+        # With no scene the number of views cannot be inferred, and 1 is as good as any.
+        if scenes == 0 and count == 0:
+            views = (0, 1)
+        elif scenes == 0 or count % scenes:
+            raise ShapeError(f"{who}: cameras must be B*V with the {whose} B = {scenes}; got {count}")
+        else:
+            views = (scenes, count // scenes)
+    if views[1] < 1:
+        raise ShapeError(f"{who}: cameras must hold at least one view a scene; got none")
+    return views
+
+
+def views_of(who: str, cameras: CameraTensors, views: tuple[int, int]) -> CameraTensors:
+    """Cameras (B, V) or (B*V,), view fastest, with leading shape (B, V)."""
+    leading = cameras.shape
+    if leading != views and leading != (views[0] * views[1],):
+        raise ShapeError(
+            f"{who}: cameras must have leading shape (B, V) = {views}, or (B*V,) with the view fastest; got {leading}"
+        )
+    if leading == views:
+        return cameras
+    height, width = (size.reshape(views) for size in image_sizes(cameras))
+    matrices = (cameras.intrinsics.reshape(*views, 3, 3), cameras.cam_from_world.reshape(*views, 4, 4))
+    return CameraTensors(*matrices, height, width)
 
 
 def _size(who: str, name: str, value: Any, leading: tuple[int, ...], like: Tensor) -> Tensor:
@@ -231,7 +358,7 @@ def stack(cameras: Sequence[Cameras], dim: int = 0) -> CameraTensors:
 
 
 def select(cameras: Cameras, dim: int, index: int) -> CameraTensors:
-    """One camera along a leading axis, as ``torch.select`` does; the inverse of `stack`.
+    """One camera along a leading axis, as ``torch.select`` does; `CameraTensors.at` takes any index.
 
     Args:
         cameras: at least one leading axis; of (B, V) cameras ``select(cameras, 1, 0)`` is the first view of each scene.
@@ -257,8 +384,7 @@ def select(cameras: Cameras, dim: int, index: int) -> CameraTensors:
         raise ShapeError(f"select: dim must be a leading axis of {leading}; got {describe(dim)}")
     if not is_whole(index) or not -leading[dim] <= index < leading[dim]:
         raise ShapeError(f"select: index must be one of {leading[dim]} cameras; got {describe(index)}")
-    fields = (tensors.intrinsics, tensors.cam_from_world, *image_sizes(tensors))
-    return CameraTensors(*(field.select(dim, index) for field in fields))
+    return tensors.at((slice(None),) * dim + (index,))
 
 
 def to(

@@ -1,4 +1,4 @@
-"""Cameras made, moved, resized and cropped; the rays of their pixels."""
+"""Cameras made, moved, resized and cropped."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from lsmgeo._checks import (
     describe,
 )
 from lsmgeo._linalg import cross, homogeneous_row, multiply, transform
-from lsmgeo.cameras.matrices import camera_matrices, resize_matrix
+from lsmgeo.cameras.matrices import resize_matrix
 from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, check_cameras, image_sizes
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, DeviceError, DTypeError, OptionError, ShapeError
 
-__all__ = ["crop", "look_at", "orbit", "perturb", "rays", "resize"]
+__all__ = ["crop", "look_at", "orbit", "perturb", "resize"]
 
 Vector = Tensor | Sequence[float]
 
@@ -303,60 +303,3 @@ def perturb(
     noisy = tensors._replace(cam_from_world=homogeneous_row(rows))
     check_cameras(who, noisy)
     return noisy
-
-
-def rays(cameras: Cameras, size: tuple[int, int] | None = None) -> tuple[Tensor, Tensor]:
-    """The ray of every pixel, in the world.
-
-    Equation: C = -R^T t, d = normalize(R^T K^-1 (u, v, 1)) at integer (u, v).
-
-    Args:
-        cameras: leading shape (...).
-        size: (h, w) of the images, for which K is resized; by default the cameras' own, which must then be one size.
-
-    Returns:
-        Camera centres (..., 3) in world units, and unit directions (..., h, w, 3). Differentiable in K, R and t.
-
-    Raises:
-        CameraError: bad values, or no size given and views of different sizes.
-
-    Example:
-        >>> from lsmgeo.cameras import orbit, rays
-        >>> origins, directions = rays(orbit(0.0, 0.0, 2.0, focal_length=10.0, height=3, width=3))
-        >>> origins
-        tensor([2., 0., 0.])
-        >>> directions[1, 1]
-        tensor([-1.,  0.,  0.])
-    """
-    who = "rays"
-    tensors = as_tensors(cameras, who)
-    check_cameras(who, tensors)
-    if size is None:
-        height, width = common_size(who, tensors)
-    else:
-        height, width = check_size(who, "size", size, 2, "(h, w)")
-    dtype, device = tensors.intrinsics.dtype, tensors.intrinsics.device
-    matrices = camera_matrices(tensors, (height, width))
-    v, u = torch.meshgrid(
-        torch.arange(height, dtype=torch.float64, device=device),
-        torch.arange(width, dtype=torch.float64, device=device),
-        indexing="ij",
-    )
-    pixels = torch.stack((u, v, torch.ones_like(u)), -1)  # (h, w, 3)
-    directions = transform(matrices.world_from_pixel()[..., None, None, :, :], pixels)
-    directions = directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True)
-    return (matrices.center + 0.0).to(dtype), directions.to(dtype)
-
-
-def common_size(who: str, cameras: CameraTensors) -> tuple[int, int]:
-    """The one image size (height, width) of all cameras; an error where they differ or where values cannot be read."""
-    if torch.compiler.is_compiling():
-        raise CameraError(f"{who}: size must be given under torch.compile and torch.export; got None")
-    heights, widths = (size.unique().tolist() for size in image_sizes(cameras))
-    if len(heights) != 1 or len(widths) != 1:
-        raise CameraError(
-            f"{who}: size must be given where views differ in size; got heights {heights}, widths {widths}"
-        )
-    if heights[0] != int(heights[0]) or widths[0] != int(widths[0]):
-        raise CameraError(f"{who}: size must be given where the cameras' is fractional; got {heights[0]} x {widths[0]}")
-    return int(heights[0]), int(widths[0])

@@ -11,8 +11,7 @@ from torch import Tensor
 from lsmgeo._checks import check_devices, check_geometry, check_positive, check_size
 from lsmgeo.cameras import as_tensors
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
-from lsmgeo.cameras.tensors import Cameras, check_cameras
-from lsmgeo.cameras.transforms import common_size
+from lsmgeo.cameras.tensors import Cameras, check_cameras, common_size
 from lsmgeo.errors import DTypeError, ShapeError
 from lsmgeo.scenes.inputs import behind, checked_lights
 from lsmgeo.scenes.lighting import Lights, shade

@@ -162,6 +162,9 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     ),
     "perturb": (cameras.perturb, {"cameras": VIEWS, "degrees": 2.0, "target": torch.zeros(3), "generator": None}),
     "rays": (cameras.rays, {"cameras": VIEWS, "size": MAP}),
+    "project": (cameras.project, {"cameras": VIEWS, "points": torch.rand(B, 11, 3) - 0.5, "near": 0.1}),
+    "unproject_depth": (cameras.unproject_depth, {"cameras": VIEWS, "depth": torch.rand(B, V, *MAP) + 1.0}),
+    "centers": (cameras.centers, {"cameras": VIEWS}),
     "from_kornia": (CameraTensors.from_kornia, {"camera": VIEWS.to_kornia()}),
     "from_opencv": (
         cameras.from_opencv,

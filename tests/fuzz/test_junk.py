@@ -39,6 +39,8 @@ SHAPES: dict[tuple[str, str, str], list[tuple[int, ...]]] = {
     ("ProjectReduce", "size", "None"): [(B, V, 2, 12, 14), (B, V, P, 12, 14)],
     ("FrustumGrid", "size", "None"): [(B, P, 12, 14, 3), (B, 4, 4)],
     ("rays", "size", "None"): [(B, V, 3), (B, V, 12, 14, 3)],
+    ("unproject_depth", "depth", "transposed"): [(B, V, 9, 8, 3)],
+    ("unproject_depth", "depth", "strided"): [(B, V, 8, 2, 3)],
     ("stack", "dim", "zero"): [(2, V, 3, 3), (2, V, 4, 4), (2, V), (2, V)],
 }
 # Whom a message blames where it is not the call's own name.

@@ -8,7 +8,7 @@ from torch import Tensor
 from lsmgeo import functional, grids, rays
 from lsmgeo._linalg import transform
 from lsmgeo._sites import direction_matrix
-from lsmgeo.cameras import matrices, transforms
+from lsmgeo.cameras import matrices, projection
 from lsmgeo.kernels import reference, request
 from lsmgeo.kernels import view_statistics as statistics
 from tests.mutants import patching
@@ -371,7 +371,7 @@ FAULTS = {
     ),
     # rays and planes
     "pixel rays through corners": around(
-        transforms.rays,
+        projection.rays,
         lambda inner, c, size=None: inner(
             c._replace(intrinsics=c.intrinsics - 0.5 * c.intrinsics.new_tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 0]])),
             size,

@@ -22,9 +22,9 @@ INVENTORY = {
         "unproject_slabs", "view_statistics",
     },
     cameras: {
-        "CameraTensors", "crop", "from_colmap", "from_opencv", "from_opengl", "from_pytorch3d", "look_at", "orbit",
-        "perturb", "rays", "resize", "stack", "to", "to_colmap", "to_opencv", "to_opengl", "to_pytorch3d", "as_tensors",
-        "select",
+        "CameraTensors", "as_tensors", "centers", "crop", "from_colmap", "from_opencv", "from_opengl", "from_pytorch3d",
+        "look_at", "orbit", "perturb", "project", "rays", "resize", "select", "stack", "to", "to_colmap", "to_opencv",
+        "to_opengl", "to_pytorch3d", "unproject_depth",
     },
     grids: {"FrustumGrid", "Lattice", "VoxelGrid", "depth_planes"},
     layers: {"PlaneSweepProject", "Unproject"},
@@ -47,6 +47,9 @@ SIGNATURES = {
     lsmgeo.FrustumGrid: "(camera, depths, size=None)",
     lsmgeo.depth_planes: "(near, far, num, spacing='depth')",
     lsmgeo.CameraTensors: "(intrinsics, cam_from_world, height, width)",
+    cameras.project: "(cameras, points, *, near=1e-06)",
+    cameras.unproject_depth: "(cameras, depth)",
+    cameras.centers: "(cameras)",
     lsmgeo.Unproject: (
         f"(grid=None, *, mode='bilinear', padding_mode='zeros', {SAMPLING}, reduce=None, near=1e-06, backend='auto')"
     ),

@@ -12,8 +12,7 @@ from torch import Tensor
 from lsmgeo._checks import check_choice, check_flag, check_number, check_size
 from lsmgeo.cameras import as_tensors
 from lsmgeo.cameras.matrices import camera_matrices
-from lsmgeo.cameras.tensors import Cameras, check_cameras
-from lsmgeo.cameras.transforms import common_size
+from lsmgeo.cameras.tensors import Cameras, check_cameras, common_size
 from lsmgeo.data.meshes import DEFAULT_COLOUR, Mesh, check_mesh
 from lsmgeo.data.meshes.mesh_topology import corner_normals, face_normals
 from lsmgeo.errors import BackendError, ShapeError

@@ -1,0 +1,206 @@
+"""The pixel rule: points to pixels, depth to points, pixels to rays, and the camera centres.
+
+Everything is computed in float64, elementwise, and cast to the dtype of what was given.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lsmgeo._checks import check_devices, check_geometry, check_number, check_size
+from lsmgeo._dtypes import saturating_cast
+from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
+from lsmgeo.cameras.tensors import (
+    Cameras,
+    as_tensors,
+    check_cameras,
+    common_size,
+    image_sizes,
+    views_of,
+    views_per_scene,
+)
+from lsmgeo.debugging import can_inspect
+from lsmgeo.errors import GridError, ShapeError
+
+__all__ = ["ProjectedPoints", "centers", "project", "rays", "unproject_depth"]
+
+
+class ProjectedPoints(NamedTuple):
+    """Where the images of V views show N points."""
+
+    pixels: Tensor  # (B, V, N, 2) as u, v
+    depth: Tensor  # (B, V, N)
+    visible: Tensor  # (B, V, N) bool
+
+
+def project(cameras: Cameras, points: Tensor, *, near: float = 1e-6) -> ProjectedPoints:
+    """Project points of the world to the pixels of each camera's own image.
+
+    Equation: ``depth (u, v, 1) = K (R X + t)`` (Hartley and Zisserman, "Multiple View Geometry", equation 6.8).
+
+    Convention:
+        Integer pixel centres. Depth is camera z. A point is visible where its depth is more than `near` and its pixel
+        lies in [-0.5, width - 0.5) x [-0.5, height - 0.5); what hides it is not known here.
+
+    Args:
+        cameras: B*V cameras with the leading shape (B, V), or (B*V,) with the view fastest.
+        points: (B, N, 3) as x, y, z in world units, float32 or float64.
+        near: least depth, world units.
+
+    Returns:
+        ``pixels`` (B, V, N, 2) as u, v, (0, 0) with zero gradient where the depth is not more than `near`; ``depth``
+        (B, V, N), negative behind the camera; ``visible`` (B, V, N) bool. Of the points' dtype; differentiable in
+        points, K, R and t.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, CameraError, GridError, OptionError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.cameras import orbit, project
+        >>> view = orbit(torch.zeros(1), 0.0, 2.0, focal_length=10.0, height=5, width=7)
+        >>> project(view, torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.2, -0.4], [3.0, 0.0, 0.0]]]))
+        ProjectedPoints(pixels=tensor([[[[3., 2.],
+                  [5., 1.],
+                  [0., 0.]]]]), depth=tensor([[[ 2.,  2., -1.]]]), visible=tensor([[[ True,  True, False]]]))
+    """
+    who = "project"
+    near = check_number(who, "near", near, "a finite number, at least 0", 0)
+    check_geometry(who, "points", points, "(B, N, 3)", rank=3)
+    if points.shape[2] != 3:
+        raise ShapeError(f"{who}: points must be (B, N, 3); got {tuple(points.shape)}")
+    tensors = as_tensors(cameras, who)
+    tensors = views_of(who, tensors, views_per_scene(who, tensors, points.shape[0], "points'"))
+    check_devices(who, cameras=tensors.intrinsics, points=points)
+    check_cameras(who, tensors)
+    _check_finite(who, "points", points)
+    P = camera_matrices(tensors).projection()[:, :, None]  # (B, V, 1, 3, 4)
+    x, y, z = points.double()[:, None, :, :, None].unbind(-2)  # (B, 1, N, 1)
+    homogeneous = P[..., 0] * x + P[..., 1] * y + P[..., 2] * z + P[..., 3]  # (B, V, N, 3)
+    distance = homogeneous[..., 2]
+    depth = saturating_cast(distance, points.dtype)
+    front = depth > near
+    pixels = homogeneous[..., :2] / torch.where(front, distance, 1.0)[..., None]
+    pixels = torch.where(front[..., None], saturating_cast(pixels, points.dtype), 0.0)
+    # Of the pixels as they are returned: rounding may bring one to the border.
+    height, width = image_sizes(tensors)
+    inside = (pixels >= -0.5) & (pixels < torch.stack((width, height), -1)[:, :, None].double() - 0.5)
+    return ProjectedPoints(pixels, depth, front & inside.all(-1))
+
+
+def unproject_depth(cameras: Cameras, depth: Tensor) -> Tensor:
+    """Points of the world that the pixels of depth maps show; the inverse of `project` at a map's pixels.
+
+    Equation: ``X = C + depth R^T K^-1 (u, v, 1)`` at integer (u, v), with the camera centre ``C = -R^T t``.
+
+    Convention:
+        Depth is camera z. Integer pixel centres; for maps of another size than the camera's image, K is resized.
+
+    Args:
+        cameras: B*V cameras with the leading shape (B, V), or (B*V,) with the view fastest.
+        depth: (B, V, h, w) in world units, float32 or float64, any finite numbers; 0 gives the camera centre.
+
+    Returns:
+        (B, V, h, w, 3) as x, y, z, of the depth's dtype; differentiable in depth, K, R and t.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, CameraError, GridError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo.cameras import orbit, unproject_depth
+        >>> view = orbit(torch.zeros(1), 0.0, 2.0, focal_length=10.0, height=3, width=3)
+        >>> unproject_depth(view, torch.full((1, 1, 3, 3), 1.0))[0, 0, 1]
+        tensor([[ 1.0000,  0.0000,  0.1000],
+                [ 1.0000,  0.0000,  0.0000],
+                [ 1.0000,  0.0000, -0.1000]])
+    """
+    who = "unproject_depth"
+    check_geometry(who, "depth", depth, "(B, V, h, w)", rank=4)
+    B, V, height, width = depth.shape
+    if V < 1 or height < 1 or width < 1:
+        raise ShapeError(f"{who}: depth must be (B, V, h, w), V, h and w at least 1; got {tuple(depth.shape)}")
+    tensors = views_of(who, as_tensors(cameras, who), (B, V))
+    check_devices(who, cameras=tensors.intrinsics, depth=depth)
+    check_cameras(who, tensors)
+    _check_finite(who, "depth", depth)
+    matrices = camera_matrices(tensors, (height, width))
+    points = (matrices.center + 0.0)[:, :, None, None] + depth.double()[..., None] * _pixel_steps(
+        matrices, height, width
+    )
+    return saturating_cast(points, depth.dtype)
+
+
+def centers(cameras: Cameras) -> Tensor:
+    """Camera centres in the world.
+
+    Equation: ``C = -R^T t``, the point that ``R X + t`` maps to 0.
+
+    Args:
+        cameras: leading shape (...).
+
+    Returns:
+        (..., 3) as x, y, z, of the cameras' dtype; differentiable in R and t.
+
+    Raises:
+        DTypeError, ShapeError, CameraError: see `lsmgeo.errors`.
+
+    Example:
+        >>> from lsmgeo.cameras import centers, orbit
+        >>> centers(orbit(0.0, 0.0, 2.0, focal_length=10.0, height=3, width=3))
+        tensor([2., 0., 0.])
+    """
+    tensors = as_tensors(cameras, "centers")
+    check_cameras("centers", tensors)
+    return (camera_matrices(tensors).center + 0.0).to(tensors.dtype)
+
+
+def rays(cameras: Cameras, size: tuple[int, int] | None = None) -> tuple[Tensor, Tensor]:
+    """The ray of every pixel, in the world.
+
+    Equation: C = -R^T t, d = normalize(R^T K^-1 (u, v, 1)) at integer (u, v).
+
+    Args:
+        cameras: leading shape (...).
+        size: (h, w) of the images, for which K is resized; by default the cameras' own, which must then be one size.
+
+    Returns:
+        Camera centres (..., 3) in world units, and unit directions (..., h, w, 3). Differentiable in K, R and t.
+
+    Raises:
+        CameraError: bad values, or no size given and views of different sizes.
+
+    Example:
+        >>> from lsmgeo.cameras import orbit, rays
+        >>> origins, directions = rays(orbit(0.0, 0.0, 2.0, focal_length=10.0, height=3, width=3))
+        >>> origins
+        tensor([2., 0., 0.])
+        >>> directions[1, 1]
+        tensor([-1.,  0.,  0.])
+    """
+    who = "rays"
+    tensors = as_tensors(cameras, who)
+    check_cameras(who, tensors)
+    if size is None:
+        height, width = common_size(who, tensors)
+    else:
+        height, width = check_size(who, "size", size, 2, "(h, w)")
+    matrices = camera_matrices(tensors, (height, width))
+    steps = _pixel_steps(matrices, height, width)
+    directions = steps / torch.linalg.vector_norm(steps, dim=-1, keepdim=True)
+    return (matrices.center + 0.0).to(tensors.dtype), directions.to(tensors.dtype)
+
+
+def _pixel_steps(matrices: CameraMatrices, height: int, width: int) -> Tensor:
+    """``R^T K^-1 (u, v, 1)``, (..., h, w, 3): the step along each pixel's ray that advances camera z by 1."""
+    M = matrices.world_from_pixel()[..., None, None, :, :]
+    u, v = (torch.arange(n, dtype=M.dtype, device=M.device)[:, None] for n in (width, height))
+    return M[..., 0] * u + M[..., 1] * v[:, None] + (M[..., 2] + 0.0)  # + 0.0: no negative zeros
+
+
+def _check_finite(who: str, name: str, value: Tensor) -> None:
+    if can_inspect(value) and not bool(value.isfinite().all()):
+        raise GridError(f"{who}: {name} must be finite; got a NaN or an infinity")

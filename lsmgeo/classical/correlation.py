@@ -15,13 +15,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-__all__ = ["UNRELATED", "Correlation", "on_threads"]
+__all__ = ["INVALID_COST", "Correlation", "on_threads"]
 
 Floats = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 # What unrelated patches cost on average, and places that nobody sees.
-UNRELATED = 1.0
+INVALID_COST = 1.0
 
 
 def on_threads(task: Callable[[int], None], numbers: Iterable[int]) -> None:
@@ -139,7 +139,7 @@ class Correlation:
             np.add(total, cost, out=total)
         np.divide(total, np.clip(count, 1, best).astype(np.float32), out=out)
         np.add(out, 1, out=out)
-        np.copyto(out, np.float32(UNRELATED), where=~seen)
+        np.copyto(out, np.float32(INVALID_COST), where=~seen)
 
 
 def _edges(length: int, window: int) -> list[tuple[slice, Floats]]:

@@ -6,8 +6,9 @@ import numpy as np
 
 from lsmgeo.classical.filtering import guided_filter
 from lsmgeo.classical.gathering import gather
-from lsmgeo.classical.plane_sweep import kept, sweep
+from lsmgeo.classical.plane_sweep import kept, run_sweep
 from lsmgeo.classical.planes import sweep_planes
+from lsmgeo.classical.sweep_options import SweepOptions
 from lsmgeo.classical.views import default_depth_range, measured_depth_range, select_neighbours
 from lsmgeo.data import PosedImages
 
@@ -58,15 +59,8 @@ def find_depth_range(
     images, cameras = gather(scene, (view, *chosen), size)
     middle = float(np.sqrt(near * far))
     depths = sweep_planes(cameras, min(near, NEARER * middle), max(far, FARTHER * middle), PLANES)
-    depth_map = sweep(
-        images,
-        cameras,
-        depths,
-        min_views=min(2, len(chosen)),
-        cost_filter=guided_filter(images[0]),
-        noise=noise,
-        memory=memory,
-    )
+    options = SweepOptions(min_views=min(2, len(chosen)), noise=noise, memory=memory, who="find_depth_range")
+    depth_map = run_sweep(images, cameras, depths, options, cost_filter=guided_filter(images[0]))
     mask = kept(depth_map, DENSITY, CONFIDENCE)
     if float(mask.float().mean()) < LEAST:
         return near, far

@@ -11,16 +11,16 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from lsmgeo import functional
-from lsmgeo._checks import check_choice, check_finite, check_float, check_mask, check_positive, check_whole
+from lsmgeo._checks import check_finite, check_float, check_mask, check_whole
 from lsmgeo.cameras import CameraTensors, select
 from lsmgeo.cameras.tensors import Cameras, as_tensors
-from lsmgeo.classical.correlation import UNRELATED, Correlation, on_threads
-from lsmgeo.errors import OptionError, ShapeError
+from lsmgeo.classical.correlation import INVALID_COST, Correlation, on_threads
+from lsmgeo.classical.sweep_options import SweepOptions
+from lsmgeo.errors import ShapeError
 from lsmgeo.grids import FrustumGrid
 
-__all__ = ["SCORES", "UNRELATED", "MatchingCosts", "aggregate_views", "matching_costs"]
+__all__ = ["INVALID_COST", "MatchingCosts", "aggregate_views", "matching_costs"]
 
-SCORES = ("zncc", "sad", "census", "cosine")
 LUMINANCE = (0.299, 0.587, 0.114)
 
 
@@ -85,12 +85,11 @@ def matching_costs(
         >>> bool(costs[0, 1, 4, 4] < 1e-3 < costs[0, 0, 4, 4])
         True
     """
+    options = SweepOptions(score=score, window=window, noise=noise, who="matching_costs")
     check_float("matching_costs", "depths", depths, "(P,)", rank=1)
-    reference, slabs = warp_neighbours(
-        images, cameras, depths, depths.shape[0], score=score, window=window, noise=noise
-    )
+    reference, slabs = warp_neighbours(images, cameras, depths, depths.shape[0], options)
     _, volume, visible = next(slabs)
-    return MatchingCosts(_comparison(score, reference, window, noise)(volume), visible)
+    return MatchingCosts(_comparison(options, reference)(volume), visible)
 
 
 class Warped(NamedTuple):
@@ -105,18 +104,10 @@ def warp_neighbours(
     cameras: Cameras,
     depths: Tensor,
     planes_per_slab: int,
-    *,
-    score: str,
-    window: int,
-    noise: float,
+    options: SweepOptions,
 ) -> Warped:
-    """Check the arguments of `matching_costs`, and warp so many planes at a time."""
+    """Check the tensors of `matching_costs`, and warp that many planes at a time."""
     who = "matching_costs"
-    check_choice(who, "score", score, SCORES)
-    window = check_whole(who, "window", window, 1)
-    if window % 2 == 0:
-        raise OptionError(f"{who}: window must be odd; got {window}")
-    check_positive(who, "noise", noise)
     check_float(who, "images", images, "(V, C, h, w)", rank=4)
     if images.shape[0] < 2:
         raise ShapeError(f"{who}: images must be (V, C, h, w) with V at least 2; got {tuple(images.shape)}")
@@ -128,9 +119,9 @@ def warp_neighbours(
             f"{who}: cameras must have the images' leading shape (V,) = ({len(images)},); "
             f"got {tuple(tensors.cam_from_world.shape[:-2])}"
         )
-    if score in ("zncc", "census"):
+    if options.score in ("zncc", "census"):
         images = luminance(images)
-    if score == "zncc":
+    if options.score == "zncc":
         # Correlation ignores an offset; without it squares lose less to rounding.
         images = images - images[0].detach().mean()
     others = CameraTensors(*(torch.as_tensor(field)[1:] for field in tensors))
@@ -152,9 +143,10 @@ def luminance(images: Tensor) -> Tensor:
     return (images * images.new_tensor(LUMINANCE)[:, None, None]).sum(1, keepdim=True)
 
 
-def _comparison(score: str, reference: Tensor, window: int, noise: float) -> Callable[[Tensor], Tensor]:
+def _comparison(options: SweepOptions, reference: Tensor) -> Callable[[Tensor], Tensor]:
     """The costs (N, d, h, w) of warped neighbours (N, C, d, h, w) against a reference (C, h, w)."""
-    if score == "zncc":
+    window, noise = options.window, options.noise
+    if options.score == "zncc":
         grey = reference[0]
         mean, spread = window_means(grey, window), _variance(grey, window) + noise**2
 
@@ -164,7 +156,7 @@ def _comparison(score: str, reference: Tensor, window: int, noise: float) -> Cal
             return 1 - covariance * (spread * (_variance(other, window) + noise**2)).rsqrt()
 
         return zncc
-    if score == "cosine":
+    if options.score == "cosine":
         energy = window_means(reference.square().mean(0), window) + noise**2
 
         def cosine(warped: Tensor) -> Tensor:
@@ -172,7 +164,7 @@ def _comparison(score: str, reference: Tensor, window: int, noise: float) -> Cal
             return 1 - dot * (energy * (window_means(warped.square().mean(1), window) + noise**2)).rsqrt()
 
         return cosine
-    if score == "sad":
+    if options.score == "sad":
         return lambda warped: window_means((warped - reference[:, None]).abs().mean(1), window)
 
     def census(warped: Tensor) -> Tensor:
@@ -227,7 +219,7 @@ def aggregate_views(
         min_views: least number of neighbours that must see a site.
 
     Returns:
-        Costs (P, h, w), `UNRELATED` where fewer than `min_views` neighbours see a site, and how many do, (P, h, w).
+        Costs (P, h, w), `INVALID_COST` where fewer than `min_views` neighbours see a site, and how many do, (P, h, w).
         Differentiable in `costs`.
 
     Raises:
@@ -247,10 +239,10 @@ def aggregate_views(
     best, min_views = _numbers(number, best, min_views)
     count = visible.sum(0)
     if number == 1:
-        return torch.where(visible[0], costs[0], UNRELATED), count
+        return torch.where(visible[0], costs[0], INVALID_COST), count
     lowest = torch.where(visible, costs, torch.inf).sort(0).values[:best]
     total = torch.where(lowest.isfinite(), lowest, 0.0).sum(0)
-    return torch.where(count >= min_views, total / count.clamp(1, best), UNRELATED), count
+    return torch.where(count >= min_views, total / count.clamp(1, best), INVALID_COST), count
 
 
 def aggregated_costs(
@@ -258,26 +250,19 @@ def aggregated_costs(
     cameras: Cameras,
     depths: Tensor,
     planes_per_slab: int,
-    *,
-    best: int | None,
-    min_views: int,
-    score: str,
-    window: int,
-    noise: float,
+    options: SweepOptions,
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """`aggregate_views` of `matching_costs`, slab by slab: costs (d, h, w) float32, and whether enough see a site."""
-    reference, slabs = warp_neighbours(
-        images, cameras, depths, planes_per_slab, score=score, window=window, noise=noise
-    )
-    best, min_views = _numbers(len(images) - 1, best, min_views)
+    reference, slabs = warp_neighbours(images, cameras, depths, planes_per_slab, options)
+    best, min_views = _numbers(len(images) - 1, options.best, options.min_views)
     is_plain = images.device.type == "cpu" and images.dtype == torch.float32 and not torch.is_grad_enabled()
-    if score != "zncc" or not is_plain:
-        compare = _comparison(score, reference, window, noise)
+    if options.score != "zncc" or not is_plain:
+        compare = _comparison(options, reference)
         for _, volume, visible in slabs:
             cost, count = aggregate_views(compare(volume), visible, best=best, min_views=min_views)
             yield cost.float(), count >= min_views
         return
-    correlate = Correlation(reference[0], window, noise).aggregate
+    correlate = Correlation(reference[0], options.window, options.noise).aggregate
     for _, volume, visible in slabs:
         cost, seen = torch.empty(visible.shape[1:]), torch.empty(visible.shape[1:], dtype=torch.bool)
         arrays = (volume[:, 0].numpy(), visible.numpy(), cost.numpy(), seen.numpy())

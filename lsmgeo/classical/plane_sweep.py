@@ -14,12 +14,13 @@ from tqdm import tqdm
 from lsmgeo._checks import check_float, check_number, check_whole
 from lsmgeo.cameras import resize
 from lsmgeo.cameras.tensors import Cameras
-from lsmgeo.classical.matching import UNRELATED, aggregated_costs
+from lsmgeo.classical.matching import INVALID_COST, aggregated_costs
 from lsmgeo.classical.planes import longest_path
-from lsmgeo.classical.winner_take_all import Winners
+from lsmgeo.classical.sweep_options import SweepOptions
+from lsmgeo.classical.winner_take_all import WinnerTakeAll
 from lsmgeo.errors import OptionError
 
-__all__ = ["DepthMap", "kept", "slab_planes", "sweep"]
+__all__ = ["DepthMap", "kept", "run_sweep", "slab_planes", "sweep"]
 
 # Minima nearer to each other are one place: a cost varies no faster than the image.
 SAME_PIXELS = 2.0
@@ -111,29 +112,31 @@ def sweep(
         OptionError: too few planes or views, or a memory bound too small for one plane.
         ShapeError, CameraError, GridError: as `lsmgeo.functional.unproject`.
     """
+    options = SweepOptions(score=score, window=window, best=best, min_views=min_views, noise=noise, memory=memory)
     check_float("sweep", "images", images, "(V, C, h, w)", rank=4)
     check_float("sweep", "depths", depths, "(P,)", rank=1)
-    views, channels, height, width = images.shape
     if depths.shape[0] < 3:
         raise OptionError(f"sweep: depths must hold at least 3 planes; got {depths.shape[0]}")
-    neighbours = max(views - 1, 1)
-    min_views = check_whole("sweep", "min_views", min_views, 1, neighbours)
-    warped = (channels if score in ("sad", "cosine") else 1) * max(1, images.element_size() // 4)
-    slab = slab_planes(neighbours, warped, (height, width), memory)
+    return run_sweep(images, cameras, depths, options, cost_filter=cost_filter, progress=progress)
+
+
+def run_sweep(
+    images: Tensor,
+    cameras: Cameras,
+    depths: Tensor,
+    options: SweepOptions,
+    *,
+    cost_filter: Callable[[Tensor], Tensor] | None = None,
+    progress: bool = False,
+) -> DepthMap:
+    """`sweep` with options that have been checked."""
+    views, channels, height, width = images.shape
+    warped = (channels if options.score in ("sad", "cosine") else 1) * max(1, images.element_size() // 4)
+    slab = slab_planes(max(views - 1, 1), warped, (height, width), options.memory)
     with torch.no_grad():
-        winners = Winners(depths, (height, width), UNRELATED, _planes_apart(cameras, depths, (height, width)))
+        winners = WinnerTakeAll(depths, (height, width), INVALID_COST, _planes_apart(cameras, depths, (height, width)))
         with tqdm(total=len(depths), desc="sweep", unit="plane", disable=None if progress else True) as bar:
-            for cost, seen in aggregated_costs(
-                images,
-                cameras,
-                depths,
-                slab,
-                best=best,
-                min_views=min_views,
-                score=score,
-                window=window,
-                noise=noise,
-            ):
+            for cost, seen in aggregated_costs(images, cameras, depths, slab, options):
                 if cost_filter is not None:
                     cost = cost_filter(cost)
                 winners.push(cost, seen)

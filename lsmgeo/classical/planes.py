@@ -15,6 +15,7 @@ from lsmgeo.grids import depth_planes
 __all__ = ["longest_path", "sweep_planes"]
 
 MOST_PLANES = 1 << 20
+SPACINGS = ("inverse", "depth", "disparity")
 
 
 def sweep_planes(cameras: Cameras, near: float, far: float, num: int = 300, spacing: str = "inverse") -> Tensor:
@@ -46,7 +47,7 @@ def sweep_planes(cameras: Cameras, near: float, far: float, num: int = 300, spac
         (300, 15)
     """
     who = "sweep_planes"
-    check_choice(who, "spacing", spacing, ("inverse", "depth", "disparity"))
+    check_choice(who, "spacing", spacing, SPACINGS)
     num = check_whole(who, "num", num, 3, MOST_PLANES)
     near, far = (check_number(who, name, end, "a number") for name, end in (("near", near), ("far", far)))
     ends = (torch.tensor(near, dtype=torch.float64), torch.tensor(far, dtype=torch.float64))

@@ -17,9 +17,10 @@ from lsmgeo.classical.consistency import consistent_views
 from lsmgeo.classical.depth_range import find_depth_range
 from lsmgeo.classical.filtering import guided_filter
 from lsmgeo.classical.gathering import gather
-from lsmgeo.classical.plane_sweep import DepthMap, kept, sweep
-from lsmgeo.classical.planes import MOST_PLANES, sweep_planes
+from lsmgeo.classical.plane_sweep import DepthMap, kept, run_sweep
+from lsmgeo.classical.planes import sweep_planes
 from lsmgeo.classical.sparse import SparseError, sparse_error
+from lsmgeo.classical.sweep_options import SweepOptions
 from lsmgeo.classical.views import camera_centers, default_depth_range, select_neighbours
 from lsmgeo.data import PosedImages
 from lsmgeo.drawing import as_pixels
@@ -35,14 +36,15 @@ __all__ = [
     "points_of",
     "reconstruct_scene",
     "reconstruct_view",
+    "reconstruct_views",
 ]
 
 # Confidence below which a pixel is never shown, however few there are: dark or plain surfaces give some depth, too.
 # What another view agrees with needs less.
 LEAST_CONFIDENCE, LEAST_CONFIDENCE_AGREED = 0.35, 0.1
 SPECK_FRACTION = 5e-4
-# Standard deviation of luminance that counts as no texture.
-NOISE = 0.5 / 255
+# The default density of several views.
+SCENE_DENSITY = 0.8
 SPECK_FACES = 100
 # Longer side in pixels of the sweep that looks for a depth range.
 COARSE_SIZE = 160
@@ -169,13 +171,36 @@ def reconstruct_scene(
         OptionError: an option out of range, or no range or neighbours can be told.
         DataError: a photograph cannot be read.
     """
-    for name, number, least in (("neighbours", neighbours, 1), ("size", size, 16), ("planes", planes, 3)):
-        if number < least:
-            raise OptionError(f"{name} must be at least {least}; got {number}")
-    if planes > MOST_PLANES:
-        raise OptionError(f"planes must be at most {MOST_PLANES}; got {planes}")
-    if not 0 < density <= 1:
-        raise OptionError(f"density must lie in (0, 1]; got {density}")
+    options = SweepOptions(
+        neighbours=neighbours,
+        size=size,
+        planes=planes,
+        spacing=spacing,
+        near=near,
+        far=far,
+        score=score,
+        window=window,
+        filtered=filtered,
+        density=density,
+        memory=memory,
+        who="reconstruct_scene",
+    )
+    return reconstruct_views(
+        scene, views, options, min_support=min_support, mesh=mesh, resolution=resolution, progress=progress
+    )
+
+
+def reconstruct_views(
+    scene: PosedImages,
+    views: Sequence[int] | None,
+    options: SweepOptions,
+    *,
+    min_support: int | None = None,
+    mesh: bool = True,
+    resolution: int = 192,
+    progress: bool = False,
+) -> SceneReconstruction:
+    """`reconstruct_scene` with options that have been checked."""
     chosen = list(range(len(scene))) if views is None else list(views)
     if not chosen or len(set(chosen)) != len(chosen):
         raise OptionError(f"views must name at least one view, none twice; got {views}")
@@ -187,32 +212,19 @@ def reconstruct_scene(
         min_support = min(1, len(chosen) - 1)
     min_support = check_whole("reconstruct_scene", "min_support", min_support, 0, len(chosen) - 1)
     is_one = len(chosen) == 1
-    alone = []
-    for view in tqdm(chosen, desc="sweep", unit="view", disable=None if progress and not is_one else True):
-        start, end = _depth_range(scene, view, near, far, min(COARSE_SIZE, size), memory)
-        matched = select_neighbours(scene, view, neighbours, near=start, far=end)
-        images, cameras = gather(scene, (view, *matched), size)
-        depths = sweep_planes(cameras, start, end, planes, spacing)
-        depth_map = sweep(
-            images,
-            cameras,
-            depths,
-            score=score,
-            window=window,
-            cost_filter=guided_filter(images[0]) if filtered else None,
-            noise=NOISE,
-            memory=memory,
-            progress=progress and is_one,
-        )
-        alone.append(_Swept(view, tuple(matched), depths, images[0].clone(), select(cameras, 0, 0), depth_map))
-    swept = tuple(_keep(scene, one, alone, min_support, density) for one in alone)
-    points = np.concatenate([one.points for one in swept])
-    colours = np.concatenate([one.colours for one in swept])
-    surface = surface_of(swept, points, resolution) if mesh and len(points) else None
-    return SceneReconstruction(swept, points, colours, surface)
+    swept = [
+        _sweep_view(scene, view, options, progress=progress and is_one)
+        for view in tqdm(chosen, desc="sweep", unit="view", disable=None if progress and not is_one else True)
+    ]
+    density = SCENE_DENSITY if options.density is None else options.density
+    kept_views = tuple(_keep(scene, one, swept, min_support, density) for one in swept)
+    points = np.concatenate([one.points for one in kept_views])
+    colours = np.concatenate([one.colours for one in kept_views])
+    surface = surface_of(kept_views, points, resolution) if mesh and len(points) else None
+    return SceneReconstruction(kept_views, points, colours, surface)
 
 
-class _Swept(NamedTuple):
+class _SweptView(NamedTuple):
     """The first fields of a `Reconstruction`, which are known before other views are asked."""
 
     view: int
@@ -223,21 +235,33 @@ class _Swept(NamedTuple):
     depth_map: DepthMap
 
 
-def _depth_range(
-    scene: PosedImages, view: int, near: float | None, far: float | None, size: int, memory: int
-) -> tuple[float, float]:
+def _sweep_view(scene: PosedImages, view: int, options: SweepOptions, *, progress: bool) -> _SweptView:
+    near, far = _depth_range(scene, view, options)
+    matched = select_neighbours(scene, view, options.neighbours, near=near, far=far)
+    images, cameras = gather(scene, (view, *matched), options.size)
+    depths = sweep_planes(cameras, near, far, options.planes, options.spacing)
+    cost_filter = guided_filter(images[0]) if options.filtered else None
+    depth_map = run_sweep(images, cameras, depths, options, cost_filter=cost_filter, progress=progress)
+    return _SweptView(view, tuple(matched), depths, images[0].clone(), select(cameras, 0, 0), depth_map)
+
+
+def _depth_range(scene: PosedImages, view: int, options: SweepOptions) -> tuple[float, float]:
+    near, far = options.near, options.far
     if near is None or far is None:
-        lower, upper = find_depth_range(scene, view, size=size, noise=NOISE, memory=memory)
+        size = min(COARSE_SIZE, options.size)
+        lower, upper = find_depth_range(scene, view, size=size, noise=options.noise, memory=options.memory)
         if (near or lower) >= (far or upper):
             lower, upper = default_depth_range(scene, view)
         near, far = near if near is not None else lower, far if far is not None else upper
-    if not 0 < near < far < float("inf"):
+    if not near < far:
         raise OptionError(f"near and far must be positive, finite and ascending; got {near} and {far}")
     return near, far
 
 
-def _keep(scene: PosedImages, one: _Swept, swept: Sequence[_Swept], least: int, density: float) -> Reconstruction:
-    """The best of the pixels of one view that so many of the others agree with."""
+def _keep(
+    scene: PosedImages, one: _SweptView, swept: Sequence[_SweptView], least: int, density: float
+) -> Reconstruction:
+    """The best pixels of one view that at least so many of the others agree with."""
     depth_map, support = one.depth_map, None
     depth, allowed = depth_map.depth, depth_map.confidence > LEAST_CONFIDENCE
     away = np.linalg.norm((centers := camera_centers(scene.cameras)) - centers[one.view], axis=1)

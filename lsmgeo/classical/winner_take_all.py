@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lsmgeo.classical.correlation import on_threads
 
-__all__ = ["Winners"]
+__all__ = ["WinnerTakeAll"]
 
 # A second minimum counts against the first only where it is another place, not the noise around the same one.
 SAME_PLANES = 2.5
@@ -18,7 +18,7 @@ Floats = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 
-class Winners:
+class WinnerTakeAll:
     """Running winners of a sweep: what is kept does not grow with the number of planes.
 
     A local minimum is placed between planes by the parabola through it and its neighbours in inverse depth, in which

@@ -75,6 +75,7 @@ def reconstruct(
     from pathlib import Path
 
     from lsmgeo import data
+    from lsmgeo.classical.sweep_options import SweepOptions
     from lsmgeo.errors import OptionError
     from lsmgeo.reconstruct.hull_method import hull_results
     from lsmgeo.reconstruct.sweep_method import readable, sweep_results
@@ -119,13 +120,7 @@ def reconstruct(
         masked |= {"method": method, "weights": weights, "views": views, "box": box, "threshold": threshold}
         results = learnt_results(images, reference, title, **masked)
     else:
-        results = sweep_results(
-            images,
-            reference,
-            title,
-            check=check,
-            resolution=resolution,
-            density=density,
+        options = SweepOptions(
             neighbours=neighbours,
             size=size,
             planes=planes,
@@ -134,8 +129,11 @@ def reconstruct(
             far=far,
             score=score,
             window=window,
+            density=density,
             memory=memory << 20,
+            who="reconstruct",
         )
+        results = sweep_results(images, reference, title, options, check=check, resolution=resolution)
     facts = (*results.facts, ("time", f"{time.perf_counter() - start:.1f} s"))
     results = results._replace(facts=facts, notes=left_out + results.notes)
     written = write_results(images, results, out)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from lsmgeo._checks import check_whole
-from lsmgeo.classical.stereo import Reconstruction, reconstruct_scene, reconstruct_view, surface_of
+from lsmgeo.classical.stereo import Reconstruction, reconstruct_views, surface_of
+from lsmgeo.classical.sweep_options import SweepOptions
 from lsmgeo.classical.views import default_depth_range, select_neighbours
 from lsmgeo.errors import DataError, OptionError
 from lsmgeo.reconstruct.write_results import Looked, Results
@@ -23,8 +24,10 @@ __all__ = ["mesh_facts", "named_colour", "readable", "sweep_results"]
 MOST_NAMED = 5
 # Kept pixels below this fraction are worth a word.
 FEW = 0.05
-# Along the longest side of the mesh's box.
+# Along the longest side of the box of the mesh.
 MOST_VOXELS = 1024
+# The default density of a view that no other is checked against.
+VIEW_DENSITY = 0.4
 
 
 def readable(scene: PosedImages) -> tuple[PosedImages, tuple[str, ...]]:
@@ -68,31 +71,26 @@ def sweep_results(
     scene: PosedImages,
     view: int | None,
     title: str,
+    options: SweepOptions,
     *,
     check: int,
     resolution: int,
-    density: float | None,
-    **options: Any,
 ) -> Results:
     """Plane-sweep stereo of one view, or of all that can be swept.
 
     Args:
         scene: posed photographs.
         view: the one to sweep; None for all.
-        title: of what is written.
-        check: how many neighbours of one view are swept too, all of which must agree with it.
-        resolution: voxels along the longest side of the mesh's box.
-        density: largest fraction of the pixels to keep; None for the method's own.
-        options: of `lsmgeo.classical.reconstruct_view`.
+        title: of the page and the figures.
+        options: of the sweeps.
+        check: the number of neighbours of one view that are swept too; all of them must agree with it.
+        resolution: voxels along the longest side of the box of the mesh.
 
     Raises:
         OptionError: an option out of range, or no view can be swept.
         DataError: a photograph cannot be read.
     """
     check_whole("reconstruct", "resolution", resolution, 8, MOST_VOXELS)
-    check_whole("reconstruct", "neighbours", options["neighbours"], 1)
-    if density is not None:
-        options |= {"density": density}
     notes: tuple[str, ...] = ()
     mesh: Mesh | None = None
     views: tuple[Reconstruction, ...]
@@ -102,7 +100,7 @@ def sweep_results(
         mesh = surface_of(views, points, resolution) if len(points) else None
     else:
         able, notes = _able(scene, options)
-        found = reconstruct_scene(scene, able, resolution=resolution, progress=True, **options)
+        found = reconstruct_views(scene, able, options, resolution=resolution, progress=True)
         views, points, colours, mesh = found.views, found.points, found.colours, found.mesh
     if not len(points):
         notes += (
@@ -129,7 +127,7 @@ def sweep_results(
     typical = " (the middle of the views' own ranges)" if len(views) > 1 else ""
     planes = f"{len(first.depths)} planes from {low:.4g} to {high:.4g}{typical}"
     facts.append(("sweep", f"{width} x {height} pixels, {planes}"))
-    facts.append(("memory", f"at most {options['memory'] >> 20} MiB a sweep beyond the libraries and the photographs"))
+    facts.append(("memory", f"at most {options.memory >> 20} MiB a sweep beyond the libraries and the photographs"))
     facts.append(("kept", f"{pixels} pixels, {100 * pixels / whole:.1f} %"))
     errors = [one.error for one in views if one.error is not None and one.error.points]
     if errors:
@@ -160,29 +158,26 @@ def _some(reasons: list[str]) -> str:
     return "; ".join(reasons[:MOST_NAMED]) + more
 
 
-def _checked_view(scene: PosedImages, view: int, check: int, options: dict[str, Any]) -> Reconstruction:
+def _checked_view(scene: PosedImages, view: int, check: int, options: SweepOptions) -> Reconstruction:
     """One view, with the pixels kept with which its best neighbours agree that can be swept themselves."""
     if check < 0:
         raise OptionError(f"check must be 0 or more; got {check}")
     others = []
     if check and len(scene) > 1:
         able, _ = _able(scene, options, only=view)
-        near, far = options["near"], options["far"]
+        near, far = options.near, options.far
         others = [other for other in select_neighbours(scene, view, check, near=near, far=far) if other in able]
-    if not others:
-        return reconstruct_view(scene, view, progress=True, **options)
-    swept = reconstruct_scene(scene, [view, *others], min_support=len(others), mesh=False, progress=True, **options)
-    return swept.views[0]
+    if not others and options.density is None:
+        options = replace(options, density=VIEW_DENSITY)
+    found = reconstruct_views(scene, [view, *others], options, min_support=len(others), mesh=False, progress=True)
+    return found.views[0]
 
 
-def _able(scene: PosedImages, options: dict[str, Any], *, only: int | None = None) -> tuple[list[int], tuple[str, ...]]:
+def _able(scene: PosedImages, options: SweepOptions, *, only: int | None = None) -> tuple[list[int], tuple[str, ...]]:
     """The views that have a depth range and neighbours, and a note on the others; one may have to be among them."""
     able, reasons = [], []
-    stated = [value for value in (options["near"], options["far"]) if value is not None]
-    if not all(0 < value < float("inf") for value in stated):
-        raise OptionError(f"near and far must be positive and finite; got {' and '.join(map(str, stated))}")
     for view in range(len(scene)):
-        near, far = options["near"], options["far"]
+        near, far = options.near, options.far
         try:
             if near is None or far is None:
                 lower, upper = default_depth_range(scene, view)
@@ -190,7 +185,7 @@ def _able(scene: PosedImages, options: dict[str, Any], *, only: int | None = Non
                 # One end alone may suit most views and lie beyond what another sees.
                 if not near < far:
                     raise OptionError(f"near and far must be positive, finite and ascending; got {near} and {far}")
-            select_neighbours(scene, view, options["neighbours"], near=near, far=far)
+            select_neighbours(scene, view, options.neighbours, near=near, far=far)
         except OptionError as error:
             if view == only:
                 raise

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.classical import aggregate_views, matching_costs
-from lsmgeo.classical.matching import SCORES
+from lsmgeo.classical.sweep_options import SCORES
 from lsmgeo.errors import CameraError, DTypeError, GridError, OptionError, ShapeError
 from tests.oracle import backproject, is_in_image, pixel_lattice, project, resize_intrinsics, sample
 

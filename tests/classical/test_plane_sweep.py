@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lsmgeo.classical import aggregate_views, matching_costs, sweep, sweep_planes
 from lsmgeo.classical.plane_sweep import slab_planes
-from lsmgeo.classical.winner_take_all import Winners
+from lsmgeo.classical.winner_take_all import WinnerTakeAll
 from lsmgeo.errors import GridError, OptionError, ShapeError
 from tests.classical import analytic
 from tests.classical.scored import cameras_of, errors, median_error, swept, within_one_plane
@@ -100,7 +100,7 @@ def test_winners_against_a_loop():
     seen = generator.random(costs.shape) < 0.85
     lowest, places, second = winners_by_loop(costs, seen, depths, 2.5)
     for slab in (1, 2, 5, 12):
-        winners = Winners(torch.from_numpy(depths), costs.shape[1:], 1.0)
+        winners = WinnerTakeAll(torch.from_numpy(depths), costs.shape[1:], 1.0)
         for start in range(0, 12, slab):
             winners.push(torch.from_numpy(costs[start : start + slab]), torch.from_numpy(seen[start : start + slab]))
         np.testing.assert_allclose(winners.best, lowest, rtol=1e-6)
@@ -118,7 +118,7 @@ def test_two_equal_minima_are_not_unique():
     costs = np.ones((9, 1, 3), np.float32)
     costs[2, 0] = 0.2
     costs[6, 0] = (0.2, 0.6, 1.0)
-    winners = Winners(torch.arange(1.0, 10.0), (1, 3), 1.0)
+    winners = WinnerTakeAll(torch.arange(1.0, 10.0), (1, 3), 1.0)
     winners.push(torch.from_numpy(costs), torch.ones(costs.shape, dtype=torch.bool))
     np.testing.assert_allclose(winners.place[0], 2, atol=0.3)
     np.testing.assert_allclose(winners.uniqueness()[0], (0, 2 / 3, 0.8), atol=1e-6)

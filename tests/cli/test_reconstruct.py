@@ -229,9 +229,9 @@ def test_the_error_at_the_sparse_points_is_the_exact_one(scene, tmp_path):
         (["--density", "0"], "density must lie in"),
         (["--density", "2"], "density must lie in (0, 1]; got 2.0"),
         (["--neighbours", "0"], "neighbours must be a whole number, at least 1; got int 0"),
-        (["--size", "0"], "size must be at least 16; got 0"),
-        (["--planes", "0"], "planes must be at least 3; got 0"),
-        (["--planes", "99999999999"], "planes must be at most 1048576; got 99999999999"),
+        (["--size", "0"], "size must be a whole number, at least 16; got int 0"),
+        (["--planes", "0"], "planes must be a whole number from 3 to 1048576; got int 0"),
+        (["--planes", "99999999999"], "planes must be a whole number from 3 to 1048576; got int 99999999999"),
         (["--near", "3", "--far", "1"], "near and far must be positive, finite and ascending; got 3.0 and 1.0"),
         (["--near", "-1"], "near and far must be positive"),
         (["--far", ".inf"], "near and far must be positive"),
@@ -258,7 +258,7 @@ def test_wrong_options_give_one_line_and_status_2(folder, tmp_path, capsys, argu
 @pytest.mark.parametrize(
     "place",
     [
-        "lsmgeo.classical.stereo.sweep",
+        "lsmgeo.classical.stereo.run_sweep",
         "lsmgeo.reconstruct.result_figures.coloured_depth",
         "lsmgeo.reconstruct.result_figures.summary",
         "os.fsync",
@@ -282,7 +282,7 @@ def test_a_place_that_cannot_be_written_is_told_before_the_work(folder, tmp_path
     def work(*_, **__):
         raise AssertionError
 
-    monkeypatch.setattr("lsmgeo.classical.stereo.sweep", work)
+    monkeypatch.setattr("lsmgeo.classical.stereo.run_sweep", work)
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "out"):
         assert cli.main(["reconstruct", str(folder), "--out", str(out)]) == 2

@@ -14,10 +14,11 @@ def moved_to(place: str, old: str) -> Callable[[str], Any]:
     """The ``__getattr__`` of a module whose content is at ``place`` now."""
 
     def find(name: str) -> Any:
-        if name.startswith("__"):
+        module = import_module(place)
+        if name.startswith("__") or not hasattr(module, name):
             raise AttributeError(f"module {old!r} has no attribute {name!r}")
         warnings.warn(f"{old} is now {place}", DeprecationWarning, stacklevel=2)
-        return getattr(import_module(place), name)
+        return getattr(module, name)
 
     return find
 

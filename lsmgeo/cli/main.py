@@ -128,7 +128,3 @@ def _reason(message: str) -> str:
             message = f"{name} must be {wanted}; got {value!r}"
     message = re.sub(r'^Parser key "(.+?)":', r"\1:", " ".join(message.split()))
     return message if len(message) <= LONGEST_MESSAGE else f"{message[:LONGEST_MESSAGE]} ..."
-
-
-if __name__ == "__main__":
-    sys.exit(main())

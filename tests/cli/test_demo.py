@@ -138,7 +138,7 @@ def test_a_reader_that_has_read_enough_ends_a_command_quietly(capfd):
 
 
 def test_another_broken_pipe_is_told(monkeypatch):
-    monkeypatch.setattr(cli, "_run", mock.Mock(side_effect=BrokenPipeError("of a worker")))
+    monkeypatch.setattr(sys.modules["lsmgeo.cli.main"], "_run", mock.Mock(side_effect=BrokenPipeError("of a worker")))
     with pytest.raises(BrokenPipeError, match="of a worker"):
         cli.main([])
 

@@ -135,7 +135,7 @@ def broken(fault: Fault | None) -> Iterator[None]:
         assert texts[fault.file].count(fault.text) >= 1, f"not to be found: {fault.text}"
         texts[fault.file] = texts[fault.file].replace(fault.text, fault.instead)
     names = {name: f"{name}_{next(COUNT)}" for name in texts}
-    texts[GRADIENTS] = texts[GRADIENTS].replace(f"lsmgeo.kernels.{KERNELS}", names[KERNELS])
+    texts[GRADIENTS] = texts[GRADIENTS].replace(f"lsmgeo.kernels.triton.{KERNELS}", names[KERNELS])
     before = launcher.kernels, operators.tables, operators.lattice_gradients
     with tempfile.TemporaryDirectory() as folder:
         kernels, gradients, tables = (_load(names[name], texts[name], Path(folder)) for name in texts)

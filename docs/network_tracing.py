@@ -185,7 +185,7 @@ def describe(module: nn.Module) -> str:
         "ConvLSTM3d": f"LSTM of {_sides(module)} convolutions, view after view",
         "_Recurrence": "GRU of 3x3x3 convolutions, view after view",
         "_Separable": "ReLU, 3x3 convolution of each channel, 1x1 convolution, norm",
-        "_Rise": "ReLU, 4x4 transposed convolution, stride 2, norm",
+        "_Upsample": "ReLU, 4x4 transposed convolution, stride 2, norm",
         "_ImageBlock": "two convolutions, shortcut, maximum over 2x2",
         "_GridBlock": "doubled, two 3x3x3 convolutions, shortcut",
         "_LastBlock": "four 3x3x3 convolutions, shortcut; two classes, as one logit",

@@ -1,4 +1,4 @@
-"""What the networks are made of: convolutions that keep sizes whole, instance norm, and what every model has."""
+"""What the networks share: convolutions by exact strides, instance norm, the base classes of models."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ __all__ = [
     "InstanceNorm",
     "Model",
     "VoxelModel",
-    "evaluating",
+    "cameras_by_scene",
+    "evaluation_mode",
     "interleave",
-    "moved_center",
-    "views_of",
+    "shift_principal_point",
 ]
 
 
 class Convolution(nn.Module):
     """A convolution, or a transposed one, whose output is the input's size divided, or multiplied, by the stride.
 
-    What is padded in all is ``kernel_size - stride``, the odd pixel after the image. Where that is even, and with it
-    for every even kernel of stride 2, a map covers the same area before and after; where it is odd (3 x 3 of stride 2),
-    maps shift by half a pixel, as those of the released network do (TensorFlow's "SAME").
+    The padding is ``kernel_size - stride`` in all, an odd pixel after the image. Where that is even, as for every even
+    kernel of stride 2, a map covers the same area before and after; where it is odd (3 x 3 of stride 2), maps shift by
+    half a pixel, as those of the released network do (TensorFlow's "SAME").
 
     Args:
         dims: 2 or 3.
         in_channels: of the input.
         out_channels: of the output.
         kernel_size: at least the stride.
-        stride: must divide the input's sides, where it is not transposed.
+        stride: must divide the input's sides, unless transposed.
         transposed: whether to multiply by the stride.
         groups: as in ``torch.nn.Conv2d``.
         bias: whether to add a learned bias.
@@ -78,8 +78,8 @@ class Convolution(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Convolve (N, C, H, W) or (N, C, D, H, W)."""
         if self.transposed:
-            spread: Callable[..., Tensor] = conv_transpose2d if self.dims == 2 else conv_transpose3d
-            y = spread(x, self.weight, self.bias, self.stride, self.before, 0, self.groups)
+            transpose: Callable[..., Tensor] = conv_transpose2d if self.dims == 2 else conv_transpose3d
+            y = transpose(x, self.weight, self.bias, self.stride, self.before, 0, self.groups)
             for axis in range(-self.dims, 0) if self.odd else ():
                 y = y.narrow(axis, 0, y.shape[axis] - 1)
             return y
@@ -99,7 +99,7 @@ class Convolution(nn.Module):
 
 
 class InstanceNorm(nn.Module):
-    """Normalisation of each channel of each sample over its pixels, with a learned shift and, if wanted, scale.
+    """Normalisation of each channel of each sample over its pixels, with a learned shift and an optional scale.
 
     Args:
         channels: of the input.
@@ -131,8 +131,8 @@ class Block(nn.Module):
         in_channels: of the input.
         out_channels: of the output.
         kernel_size: of the convolution.
-        norm: "scale" and "shift" learn both or the shift alone; after "none" the convolution has a bias.
-        activate: whether to begin with the ReLU; the first block of a network does not.
+        norm: "scale" learns scale and shift, "shift" only the shift; with "none" the convolution has a bias.
+        activate: whether it begins with the ReLU; the first block of a network does not.
         stride: see `Convolution`.
         transposed: see `Convolution`.
 
@@ -195,14 +195,14 @@ class Model(nn.Module):
     """Base class of the models.
 
     Attributes:
-        name: by which `lsmgeo.models.create` knows it.
-        settings: what it was built from, a frozen dataclass that JSON can hold.
+        name: its name in `lsmgeo.models.create`.
+        settings: what it is built from, a frozen dataclass that JSON can hold.
         output: "voxels" or "depth".
         image_size: side in pixels of the square images that it is meant for.
         resolution: voxels along a side of its finest grid.
         grid: that grid.
         prefers_channels_last: whether it trains faster on CPUs with maps kept pixel by pixel in memory.
-        about: the notes of the file that it was loaded from.
+        about: the notes of the file that it was loaded from, if any.
     """
 
     name: str
@@ -216,7 +216,7 @@ class Model(nn.Module):
 
 
 class VoxelModel(Model):
-    """Base class of those that give occupancy."""
+    """Base class of the models that give occupancy."""
 
     output = "voxels"
 
@@ -229,7 +229,7 @@ class VoxelModel(Model):
             images: (B, V, 3, H, W) in [0, 1].
             cameras: B*V cameras.
             view_mask: (B, V) bool.
-            by_view: whether to tell what is known after every view too, at V times the work of the last networks.
+            by_view: whether to predict after every view too, at V times the work of the last networks.
 
         Returns:
             `VoxelResult`, float32.
@@ -238,15 +238,15 @@ class VoxelModel(Model):
             ShapeError, DTypeError, DeviceError, CameraError, OptionError: see `lsmgeo.errors`.
         """
         check_flag(self.name, "by_view", by_view)
-        with evaluating(self):
+        with evaluation_mode(self):
             logits = self(images, cameras, view_mask, steps=None if by_view else "last").logits
             occupancy = logits.float().sigmoid()
         return VoxelResult(occupancy[:, -1], occupancy if by_view else None)
 
 
 @contextmanager
-def evaluating(model: nn.Module) -> Iterator[None]:
-    """Evaluation mode and no gradients inside; the mode before, after."""
+def evaluation_mode(model: nn.Module) -> Iterator[None]:
+    """Evaluation mode without gradients; the mode from before is restored."""
     was_training = model.training
     model.eval()
     try:
@@ -256,11 +256,11 @@ def evaluating(model: nn.Module) -> Iterator[None]:
         model.train(was_training)
 
 
-def moved_center(who: str, cameras: Cameras, pixels: float) -> CameraTensors:
+def shift_principal_point(who: str, cameras: Cameras, pixels: float) -> CameraTensors:
     """Move the principal points of cameras.
 
     Args:
-        who: the model that asks, named in errors.
+        who: the model, named in errors.
         cameras: of any leading shape.
         pixels: of the image, to the right and down.
 
@@ -273,8 +273,8 @@ def moved_center(who: str, cameras: Cameras, pixels: float) -> CameraTensors:
     return tensors._replace(intrinsics=tensors.intrinsics + offset)
 
 
-def views_of(who: str, cameras: Cameras, scenes: int) -> CameraTensors:
-    """Cameras with the leading shape (B, V), whatever form they came in."""
+def cameras_by_scene(who: str, cameras: Cameras, scenes: int) -> CameraTensors:
+    """Cameras of any form, with the leading shape (B, V)."""
     tensors = as_tensors(cameras, who)
     leading = tuple(tensors.cam_from_world.shape[:-2])
     if len(leading) == 2 and leading[0] == scenes:

@@ -1,4 +1,4 @@
-"""Models by name: from a preset, and from the settings that a model keeps."""
+"""Models by name: presets, and the settings that a model keeps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lsmgeo.errors import DTypeError, OptionError
 from lsmgeo.models.blocks import Model
 from lsmgeo.models.depth_lsm import DepthLSM
 from lsmgeo.models.r2n2 import R2N2, R2N2Settings
-from lsmgeo.models.settings import DepthSettings, VoxelSettings, nearest
+from lsmgeo.models.settings import DepthSettings, VoxelSettings, suggestion
 from lsmgeo.models.voxel_lsm import VoxelLSM
 
 __all__ = ["MODELS", "PRESETS", "RELEASES", "create", "from_settings", "settings_of"]
@@ -25,8 +25,8 @@ MODELS: dict[str, type[Model]] = {
     "r2n2-pose": R2N2,
 }
 
-# Views are fused on 16^3 cells, but their features are sampled at 32^3. The recurrence works point by point: with 3^3
-# kernels it takes most of a step's time, and the grid network sees the neighbours.
+# Views are fused on 16^3 cells, but their features are sampled at 32^3. The recurrence's kernels are 1^3: with 3^3 it
+# takes most of a step's time, and the grid network reads the neighbours.
 _COMPACT: dict[str, Any] = {
     "image_size": 128,
     "grid_size": 16,
@@ -74,7 +74,7 @@ _TINY_R2N2: dict[str, Any] = {
 
 
 def _presets(paper: Any, compact: Any, tiny: Any) -> dict[str, Any]:
-    # "standard" is what the experiments use: a wider network was no better in the same time (docs/experiments).
+    # "standard" is that of the experiments: a wider network was no better in the same time (docs/experiments).
     return {"paper": paper, "compact": compact, "standard": compact, "tiny": tiny}
 
 
@@ -93,7 +93,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     ),
 }
 
-# Built layer by layer as released; there is one of each.
+# The released networks, layer by layer.
 RELEASES: dict[str, Any] = {
     "voxel-lsm": VoxelSettings(variant="release"),
     "depth-lsm": DepthSettings(variant="release", ray_channels=(512,)),
@@ -101,21 +101,22 @@ RELEASES: dict[str, Any] = {
 
 
 def create(name: str, *, preset: str = "paper", variant: str = "paper", **overrides: Any) -> Model:
-    """Build a model with weights that start at random (from PyTorch's generator).
+    """Build a model with random weights (from PyTorch's generator).
 
     Args:
         name: "voxel-lsm", "depth-lsm", "r2n2" or "r2n2-pose".
-        preset: "paper" (224 pixels, 32^3 voxels), "compact" (128 pixels, 32^3 voxels, made for training on a CPU
-            core in half an hour), "standard" (what the experiments use, which is compact) or "tiny" (32 pixels, 16^3
-            voxels, made for tests).
-        variant: "paper", or "release" for the layers of the released network, of "voxel-lsm" and "depth-lsm" alone.
-        **overrides: settings by name in place of the preset's, see `VoxelSettings`, `DepthSettings` and `R2N2Settings`.
+        preset: "paper" (224 pixels, 32^3 voxels), "compact" (128 pixels, 32^3 voxels, for training on a CPU core
+            in half an hour), "standard" (that of the experiments, which is compact) or "tiny" (32 pixels, 16^3 voxels,
+            for tests).
+        variant: "paper", or "release" for the layers of the released network, of "voxel-lsm" and "depth-lsm" only.
+        **overrides: settings by name in place of the preset's, see `VoxelSettings`, `DepthSettings` and `R2N2Settings`;
+            of "voxel-lsm" and "depth-lsm" also an `encoder`.
 
     Returns:
         The model. It keeps its `settings`, and ``create(name, **settings)`` builds the same again.
 
     Raises:
-        OptionError: an unknown name or setting, or an impossible value.
+        OptionError: an unknown name or setting, or an invalid value.
 
     Example:
         >>> from lsmgeo.models import create
@@ -164,16 +165,16 @@ def settings_of(model: nn.Module) -> dict[str, Any]:
 
 
 def from_settings(settings: Mapping[str, Any]) -> Model:
-    """Build the model that `settings_of` described, with weights that start at random.
+    """Build the model that `settings_of` described, with random weights.
 
     Args:
-        settings: "name", and settings; those that are missing are the paper's.
+        settings: "name", and settings; missing ones are the paper's.
 
     Returns:
         The model.
 
     Raises:
-        OptionError: an unknown name or setting, or an impossible value.
+        OptionError: an unknown name or setting, or an invalid value.
 
     Example:
         >>> from lsmgeo.models import create
@@ -188,5 +189,7 @@ def from_settings(settings: Mapping[str, Any]) -> Model:
 
 def _class(name: object) -> type[Model]:
     if not isinstance(name, str) or name not in MODELS:
-        raise OptionError(f"create: name must be one of the models; got {describe(name)}{nearest(name, list(MODELS))}")
+        raise OptionError(
+            f"create: name must be one of the models; got {describe(name)}{suggestion(name, list(MODELS))}"
+        )
     return MODELS[name]

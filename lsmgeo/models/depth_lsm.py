@@ -1,4 +1,7 @@
-"""D-LSM, the Depth Learnt Stereo Machine: images and cameras to a depth map of each view."""
+"""D-LSM, a multi-view stereo network from images and cameras to a depth map of each view.
+
+`LSMTrunk`, which is V-LSM's too, then ``PlaneSweepProject -> reduction along rays -> upsampling`` in this file.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +18,17 @@ from lsmgeo.cameras.tensors import Cameras, CameraTensors, image_sizes
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid, depth_planes
 from lsmgeo.layers import PlaneSweepProject
-from lsmgeo.models.blocks import Block, Convolution, InstanceNorm, evaluating, moved_center, views_of
+from lsmgeo.models.blocks import (
+    Block,
+    Convolution,
+    InstanceNorm,
+    cameras_by_scene,
+    evaluation_mode,
+    shift_principal_point,
+)
 from lsmgeo.models.outputs import DepthOutput, DepthResult
-from lsmgeo.models.settings import DepthSettings, changed
-from lsmgeo.models.voxel_lsm import Machine
+from lsmgeo.models.settings import DepthSettings, replace_settings
+from lsmgeo.models.voxel_lsm import LSMTrunk
 from lsmgeo.rays import ProjectReduce
 
 __all__ = ["DepthLSM"]
@@ -27,7 +37,7 @@ PAPER = DepthSettings()
 
 
 class _Separable(nn.Module):
-    """A 3x3 convolution of each channel and a 1x1 convolution, as the release reduces what lies along a ray."""
+    """A 3x3 convolution of each channel and a 1x1 convolution: the release's reduction of the features along a ray."""
 
     def __init__(self, in_channels: int, out_channels: int, *, activate: bool) -> None:
         super().__init__()
@@ -40,8 +50,8 @@ class _Separable(nn.Module):
         return self.norm(self.pointwise(self.depthwise(x.relu() if self.activate else x)))
 
 
-class _Rise(nn.Module):
-    """Twice the size: by nearest neighbours and a 3x3 convolution in the release, else by a transposed convolution."""
+class _Upsample(nn.Module):
+    """Twice the size: nearest neighbours and a 3x3 convolution in the release, else a transposed convolution."""
 
     def __init__(self, in_channels: int, out_channels: int, *, is_release: bool) -> None:
         super().__init__()
@@ -55,17 +65,17 @@ class _Rise(nn.Module):
         return self.block(interpolate(x, scale_factor=2.0, mode="nearest") if self.is_release else x)
 
 
-class DepthLSM(Machine):
+class DepthLSM(LSMTrunk):
     """The Depth Learnt Stereo Machine: any number of images with cameras to a depth map of each of them.
 
-    The grid is made as in `VoxelLSM`; it is swept by planes of depth in each view's camera, with depth and ray
-    direction as further channels; what lies along a ray is reduced by 1x1 convolutions, the first of them fused with
-    the sweep; transposed convolutions bring it to the image's size, beside the image encoder's early maps.
+    The grid is computed as in `VoxelLSM` and swept by planes of depth in each view's camera, with depth and ray
+    direction as further channels; 1x1 convolutions reduce the features along a ray, the first of them fused with the
+    sweep; transposed convolutions upsample to the image's size, beside the image encoder's early maps.
 
     Source: Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017, section 3. Where the paper is silent
     the authors' release is followed, as in `VoxelLSM`. The variant "release" has the release's layers one by one
     (3,888,673 parameters, without a layer that it builds and never trains): separable convolutions over the stacked
-    planes, enlarging by nearest neighbours, nothing but features in the sweep. The geometry is this library's in both
+    planes, upsampling by nearest neighbours, only features in the sweep. The geometry is this library's in both
     variants.
 
     Convention:
@@ -73,14 +83,15 @@ class DepthLSM(Machine):
         is computed in float32 under autocast too: bfloat16 would round depths of 2 to steps of 1/64.
 
     Args:
-        settings: `DepthSettings`, which follow as keywords; `lsmgeo.models.create` has presets.
+        settings: `DepthSettings`, whose fields are also keywords; `lsmgeo.models.create` has presets.
+        encoder: an image encoder of your own, as for `VoxelLSM`; needs ``skips=False``, since it has no early maps.
 
     Shape:
         - images: (B, V, 3, H, W) in [0, 1]; cameras: B*V, view fastest; view_mask: (B, V).
         - depth: (B, S, T, H, W), after S of the views, of the V views or of T others.
 
     Raises:
-        OptionError: a setting that is none, or an impossible value.
+        OptionError: an unknown setting, or an impossible value.
 
     Example:
         >>> import torch
@@ -97,15 +108,19 @@ class DepthLSM(Machine):
     name = "depth-lsm"
     output = "depth"
 
-    def __init__(self, settings: DepthSettings = PAPER, **changes: Any) -> None:
-        settings = changed(settings, changes)
-        super().__init__(settings)
+    def __init__(self, settings: DepthSettings = PAPER, *, encoder: nn.Module | None = None, **changes: Any) -> None:
+        settings = replace_settings(settings, changes)
+        if encoder is not None and settings.skips:
+            raise OptionError(f"{self.name}: skips must be False with an encoder of your own, which has no early maps")
+        super().__init__(settings, encoder)
+        if encoder is not None:
+            self.image_stride = settings.map_stride
         self.settings = settings
         is_release = settings.variant == "release"
         planes = depth_planes(settings.near, settings.far, settings.planes)
         swept = self.grid
         if settings.pixel_rules == "release":
-            # round() of an index that counts from the box's side: every voxel is read half a voxel back.
+            # The release rounds an index that counts from the box's side: every voxel is read half a voxel back.
             back = 0.5 / settings.grid_size
             swept = VoxelGrid(settings.grid_size, -0.5 - back, 0.5 - back)
         channels, early = self.grid_network.out_channels, settings.encoder_channels
@@ -137,7 +152,7 @@ class DepthLSM(Machine):
         sides = 2 if settings.skips else 1
         widths = (*early[level::-1], early[0])
         self.rise = nn.ModuleList(
-            _Rise(sides * before, after, is_release=is_release) for before, after in pairwise(widths)
+            _Upsample(sides * before, after, is_release=is_release) for before, after in pairwise(widths)
         )
         self.out = Block(2, early[0], 1, 3, norm="none")
         assert self.out.convolution.bias is not None
@@ -157,9 +172,9 @@ class DepthLSM(Machine):
         Args:
             images: (B, V, 3, H, W) in [0, 1].
             cameras: B*V cameras.
-            view_mask: (B, V) bool; views where it is False are not read, and what follows repeats what was before.
+            view_mask: (B, V) bool; views where it is False are not read, and the answer before them is repeated.
             steps: after which views: None for all, "last", or their indices.
-            target_cameras: B*T cameras whose depth is wanted in place of the images' own; needs ``skips=False``.
+            target_cameras: B*T cameras to predict the depth of, in place of the images' own; needs ``skips=False``.
 
         Returns:
             `DepthOutput` with depth (B, S, T, H, W); 0 in masked views.
@@ -170,15 +185,15 @@ class DepthLSM(Machine):
         if target_cameras is not None and self.settings.skips:
             raise OptionError(
                 f"{self.name}: target_cameras must be None for a model with skips, which needs the views' images; "
-                "make one with skips=False"
+                "create it with skips=False"
             )
-        grids, early = self.see(images, cameras, view_mask, steps)
+        grids, early = self.encode(images, cameras, view_mask, steps)
         B, S = grids.shape[:2]
-        targets = views_of(self.name, cameras if target_cameras is None else target_cameras, B)
+        targets = cameras_by_scene(self.name, cameras if target_cameras is None else target_cameras, B)
         mask = view_mask if target_cameras is None else None
         if self.settings.pixel_rules == "release":
             # Rays pass the corner of a map's pixels.
-            targets = moved_center(self.name, targets, -0.5)
+            targets = shift_principal_point(self.name, targets, -0.5)
         views = (B * S, targets.cam_from_world.shape[1])
         size = (images.shape[-2] // self.settings.map_stride, images.shape[-1] // self.settings.map_stride)
         maps, _ = self.sweep(
@@ -213,8 +228,8 @@ class DepthLSM(Machine):
             images: (B, V, 3, H, W) in [0, 1].
             cameras: B*V cameras.
             view_mask: (B, V) bool.
-            by_view: whether to tell what is known after every view too, at V times the work of the last networks.
-            target_cameras: B*T cameras whose depth is wanted in place of the images' own; needs ``skips=False``.
+            by_view: whether to predict after every view too, at V times the work of the last networks.
+            target_cameras: B*T cameras to predict the depth of, in place of the images' own; needs ``skips=False``.
 
         Returns:
             `DepthResult`, float32.
@@ -223,12 +238,12 @@ class DepthLSM(Machine):
             ShapeError, DTypeError, DeviceError, CameraError, OptionError: see `lsmgeo.errors`.
         """
         check_flag(self.name, "by_view", by_view)
-        with evaluating(self):
+        with evaluation_mode(self):
             steps = None if by_view else "last"
             depth = self(images, cameras, view_mask, steps=steps, target_cameras=target_cameras).depth.float()
         return DepthResult(depth[:, -1], depth if by_view else None)
 
 
-def _repeat(item: Tensor, steps: int) -> Tensor:
-    """(B, V, ...) as (B*S, V, ...), the same for every step."""
-    return item[:, None].expand(-1, steps, *item.shape[1:]).flatten(0, 1)
+def _repeat(item: Tensor, times: int) -> Tensor:
+    """(B, V, ...) as (B*S, V, ...), each scene S times."""
+    return item[:, None].expand(-1, times, *item.shape[1:]).flatten(0, 1)

@@ -1,4 +1,4 @@
-"""What training makes small: cross-entropy and overlap of occupancy, absolute error of depth."""
+"""The losses: cross-entropy and overlap of occupancy, absolute error of depth."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from lsmgeo._checks import check_choice
 from lsmgeo.data.sample import Batch
 from lsmgeo.errors import DTypeError, ShapeError
-from lsmgeo.models.outputs import DepthOutput, VoxelOutput, chosen_steps
+from lsmgeo.models.outputs import DepthOutput, VoxelOutput, views_used
 
 __all__ = ["LOSSES", "compute_loss", "sum_loss"]
 
@@ -32,13 +32,13 @@ def sum_loss(
 
     Args:
         output: of a model.
-        batch: what it was fed with.
+        batch: its input, and the truth.
         region: see `compute_loss`.
         loss: see `compute_loss`.
         steps: see `compute_loss`.
 
     Returns:
-        The sum of the terms and how many there are, both float32 scalars; the sum alone is differentiable.
+        The sum of the terms and how many there are, both float32 scalars; only the sum is differentiable.
 
     Raises:
         ShapeError, DTypeError, OptionError: see `lsmgeo.errors`.
@@ -68,17 +68,17 @@ def sum_loss(
         raise ShapeError(
             f"{who}: batch must have {form} as predicted, {tuple(predicted.shape)}; got {tuple(truth.shape)}"
         )
-    after = chosen_steps(who, steps, batch.view_mask.shape[1])
+    after = views_used(who, steps, batch.view_mask.shape[1])
     if predicted.shape[1] != len(after):
-        raise ShapeError(f"{who}: output must be after {len(after)} steps; got {tuple(predicted.shape)}")
-    # After the last of the views there is always something to tell, also where its own place is padding.
-    is_told = batch.view_mask.any(1, keepdim=True) if steps == "last" else batch.view_mask[:, after]
-    weight = is_told.float()[:, :, None, None, None]
+        raise ShapeError(f"{who}: output must be after {len(after)} views; got {tuple(predicted.shape)}")
+    # After the last view every scene has an answer, also where its own last view is padding.
+    has_answer = batch.view_mask.any(1, keepdim=True) if steps == "last" else batch.view_mask[:, after]
+    weight = has_answer.float()[:, :, None, None, None]
     if isinstance(output, DepthOutput):
         is_object = truth > 0 if batch.mask is None else (truth > 0) & batch.mask
         counted = is_object if region == "object" else torch.ones_like(is_object)
         weight = weight * (counted & batch.view_mask[:, :, None, None])[:, None]
-    # Left out before and after, by choice and not by product: 0 times a NaN or an infinity reaches sums and gradients.
+    # Left out by choice and not by product, before and after: 0 times NaN or infinity is NaN, also in gradients.
     counts = weight > 0
     predicted = torch.where(counts, predicted.float(), 0.0)
     if isinstance(output, VoxelOutput):
@@ -88,10 +88,10 @@ def sum_loss(
         terms = (predicted - torch.where(is_object, truth, FAR)[:, None]).abs()
     total = torch.where(counts, terms, 0.0).sum()
     if isinstance(output, VoxelOutput) and loss == "bce+iou":
-        # Of a shape without voxels the overlap is 0 whatever is predicted.
-        is_counted = is_told & truth.flatten(1).any(1, keepdim=True)
-        apart = torch.where(is_counted, 1 - _soft_iou(predicted, target), 0.0)
-        total = total + IOU_WEIGHT * truth.shape[1:].numel() * apart.sum()
+        # The overlap with an empty shape is 0 whatever is predicted.
+        is_counted = has_answer & truth.flatten(1).any(1, keepdim=True)
+        missing = torch.where(is_counted, 1 - _soft_iou(predicted, target), 0.0)
+        total = total + IOU_WEIGHT * truth.shape[1:].numel() * missing.sum()
     return total, weight.expand(terms.shape).sum()
 
 
@@ -110,21 +110,21 @@ def compute_loss(
     loss: str = "bce",
     steps: str | Sequence[int] | None = None,
 ) -> Tensor:
-    """The loss of a model's output: the mean over scenes, over the steps that they have, and over voxels or pixels.
+    """The loss of a model's output: the mean over scenes, their views, and voxels or pixels.
 
     Equation: binary cross-entropy of occupancy; absolute error of depth (Kar, Haene and Malik, "Learning a Multi-View
-    Stereo Machine", 2017, section 3). "bce+iou" adds ``0.1 (1 - sum p t / sum (p + t - p t))`` of each scene and step
+    Stereo Machine", 2017, section 3). "bce+iou" adds ``0.1 (1 - sum p t / sum (p + t - p t))`` of each scene and view
     (the overlap of Rahman and Wang, "Optimizing Intersection-Over-Union in Deep Neural Networks", 2016), p the
-    probabilities and t the truth: few voxels are solid, and cross-entropy alone is slow to leave "all empty".
+    probabilities and t the truth: few voxels are solid, and cross-entropy by itself is slow to leave "all empty".
     In float32 whatever the output's dtype.
 
     Args:
         output: of a model.
         batch: what it was fed with, with `occupancy` of the output's resolution, or `depth`.
-        region: of depth maps: "object" for the pixels on the object, "all" for every pixel of the views that are there,
-            with the background 10 units away (the release's).
+        region: of depth maps: "object" for the pixels on the object, "all" for every pixel of the unmasked views, with
+            the background 10 units away (the release's).
         loss: of occupancy: "bce", the paper's, or "bce+iou".
-        steps: what the model was called with. A scene's steps that are padding do not count.
+        steps: what the model was called with. Masked views do not count.
 
     Returns:
         A scalar, float32; 0 where nothing counts.

@@ -1,4 +1,4 @@
-"""What the models return, and after which of their views."""
+"""What the models return, and after which views."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torch import Tensor
 from lsmgeo._checks import check_whole, describe
 from lsmgeo.errors import OptionError
 
-__all__ = ["DepthOutput", "DepthResult", "VoxelOutput", "VoxelResult", "chosen_steps"]
+__all__ = ["DepthOutput", "DepthResult", "VoxelOutput", "VoxelResult", "views_used"]
 
 
 class VoxelOutput(NamedTuple):
-    """What a voxel model says in training.
+    """What a voxel network gives in training.
 
     Attributes:
         logits: (B, S, D, H, W); their sigmoid is the probability that a voxel is occupied, after S of the views.
@@ -24,7 +24,7 @@ class VoxelOutput(NamedTuple):
 
 
 class DepthOutput(NamedTuple):
-    """What a depth model says in training.
+    """What a depth network gives in training.
 
     Attributes:
         depth: (B, S, T, H, W) camera z of T views in world units, after S of the views; 0 in masked views.
@@ -34,7 +34,7 @@ class DepthOutput(NamedTuple):
 
 
 class VoxelResult(NamedTuple):
-    """Occupancy, as `run` gives it.
+    """What `run` of a voxel network gives.
 
     Attributes:
         occupancy: (B, D, H, W) probabilities in [0, 1], after all views.
@@ -46,7 +46,7 @@ class VoxelResult(NamedTuple):
 
 
 class DepthResult(NamedTuple):
-    """Depth, as `run` gives it.
+    """What `run` of a depth network gives.
 
     Attributes:
         depth: (B, T, H, W) camera z of T views in world units, after all views; 0 in masked views.
@@ -57,11 +57,11 @@ class DepthResult(NamedTuple):
     by_view: Tensor | None
 
 
-def chosen_steps(who: str, steps: str | Sequence[int] | None, views: int) -> list[int]:
-    """The indices of the views after which something is to be predicted.
+def views_used(who: str, steps: str | Sequence[int] | None, views: int) -> list[int]:
+    """The indices of the views after which the network predicts.
 
     Args:
-        who: the model that asks, named in errors.
+        who: the network, named in errors.
         steps: None for after every view, "last", or indices from 0 to V - 1.
         views: V.
 
@@ -69,10 +69,10 @@ def chosen_steps(who: str, steps: str | Sequence[int] | None, views: int) -> lis
         S indices.
 
     Raises:
-        OptionError: neither of these, or no index.
+        OptionError: none of these, or an index out of range.
 
     Example:
-        >>> chosen_steps("voxel-lsm", "last", 4), chosen_steps("voxel-lsm", None, 3)
+        >>> views_used("voxel-lsm", "last", 4), views_used("voxel-lsm", None, 3)
         ([3], [0, 1, 2])
     """
     if steps is None:

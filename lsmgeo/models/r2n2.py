@@ -1,4 +1,4 @@
-"""3D-R2N2, the baseline without geometry: a residual network and a recurrence that read images one after another."""
+"""3D-R2N2, the baseline without geometry: a residual network for images, a recurrence over views, a decoder."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from lsmgeo.cameras.tensors import Cameras, as_tensors, check_cameras
 from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.grids import VoxelGrid
 from lsmgeo.models.blocks import VoxelModel, interleave
-from lsmgeo.models.outputs import VoxelOutput, chosen_steps
-from lsmgeo.models.settings import changed, check_settings
+from lsmgeo.models.outputs import VoxelOutput, views_used
+from lsmgeo.models.settings import check_settings, replace_settings
 
 __all__ = ["R2N2", "R2N2Settings"]
 
 
 @dataclass(frozen=True)
 class R2N2Settings:
-    """What an `R2N2` is built from; JSON can hold it. The defaults are the original's.
+    """The settings of an `R2N2`. The defaults are the original's.
 
     Attributes:
-        pose: whether the cameras' rotation is read too.
+        pose: whether the network reads the cameras' rotations too.
         image_size: side of the square images in pixels.
-        channels: of the image encoder's blocks; each ends in a maximum over 2 x 2 pixels.
+        channels: of the image encoder's blocks; each ends in max pooling over 2 x 2 pixels.
         shortcuts: past the two convolutions of each block: "none", "convolution" (1x1), "identity".
-        features: length of the vector that an image becomes.
-        pose_features: length of the vector that a rotation becomes.
+        features: length of an image's vector.
+        pose_features: length of a rotation's vector.
         coarse: voxels along a side of the recurrence's grid.
         hidden: its channels.
-        decoder: channels of the blocks after it; each but the last doubles the grid.
+        decoder: channels of the blocks after it; all but the last double the grid.
         upsample: voxels of the occupancy along a side of one of the last block's: a cheap way to a finer output.
     """
 
@@ -77,7 +77,7 @@ PAPER = R2N2Settings()
 
 
 class _ImageBlock(nn.Module):
-    """Two convolutions, a shortcut past both, and the maximum over 2 x 2 pixels, the first of them off the border."""
+    """Two convolutions, a shortcut past both, and max pooling over 2 x 2 pixels that starts one pixel outside."""
 
     def __init__(self, before: int, channels: int, kernel_size: int, shortcut: str) -> None:
         super().__init__()
@@ -95,9 +95,9 @@ class _ImageBlock(nn.Module):
 
 
 class _GridBlock(nn.Module):
-    """A grid of twice the side, with the values at even voxels and 0 between, two convolutions and a shortcut.
+    """Unpooling (values at even voxels, 0 between), two convolutions and a shortcut.
 
-    A convolution of such a grid is a transposed convolution of the small one, at an eighth of the work.
+    Unpooling and the first convolution are one transposed convolution, at an eighth of the work.
     """
 
     def __init__(self, before: int, channels: int) -> None:
@@ -118,7 +118,7 @@ class _GridBlock(nn.Module):
 
 
 class _LastBlock(nn.Module):
-    """Three convolutions of 3 voxels, the second and third of the first's answer and added, then one to two classes."""
+    """A convolution, the sum of two of its output, and one to two classes."""
 
     def __init__(self, before: int, channels: int, upsample: int) -> None:
         super().__init__()
@@ -136,7 +136,7 @@ class _LastBlock(nn.Module):
 
 
 class _Recurrence(nn.Module):
-    """A gated recurrent unit whose state is a grid; the vector that it reads reaches every voxel by weights of its own.
+    """A gated recurrent unit whose state is a grid; a fully connected layer maps its input, a vector, onto the grid.
 
     Equation: u = sigmoid(W_u x + U_u * h), r = sigmoid(W_r x + U_r * h), c = tanh(W_c x + U_c * (r h)),
     h' = u h + (1 - u) c.
@@ -149,7 +149,7 @@ class _Recurrence(nn.Module):
         self.gates = nn.Conv3d(hidden, 2 * hidden, 3, padding=1)
         self.candidate = nn.Conv3d(hidden, hidden, 3, padding=1)
         self.apply(_initialise)
-        # Weights of the gates lie in one tensor, but start as three.
+        # The weights of the gates are one tensor, but initialised as three.
         for weights in (*self.read.weight.chunk(3), *self.gates.weight.chunk(2)):
             nn.init.xavier_normal_(weights, sqrt(2))
 
@@ -171,9 +171,9 @@ class _Recurrence(nn.Module):
 class R2N2(VoxelModel):
     """The residual-GRU network of 3D-R2N2, with or without the cameras' rotation.
 
-    Images become vectors, one by one; a recurrence on a coarse grid reads them in their order; from its state a decoder
-    makes occupancy. No geometry: without `pose` cameras are not read at all, and with it a rotation's quaternion goes
-    through two fully connected layers and on, beside the image's vector, into the recurrence.
+    Each image becomes a vector; a recurrence on a coarse grid reads the vectors in order; a decoder turns its state
+    into occupancy. No geometry: without `pose` cameras are not read at all, and with it the rotation's quaternion goes
+    through two fully connected layers and is appended to the image's vector.
 
     Source: Choy et al., "3D-R2N2: A Unified Approach for Single and Multi-view 3D Object Reconstruction", 2016, section
     3, layer by layer as released; with pose: Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017,
@@ -181,10 +181,10 @@ class R2N2(VoxelModel):
 
     Convention:
         The quaternion is that of the world-to-camera rotation. Of its two signs the one with z >= 0 is taken: the real
-        part of an upright, level camera is 0, so that its sign would tell nothing but rounding.
+        part of an upright, level camera is 0, so its sign would depend on rounding.
 
     Args:
-        settings: `R2N2Settings`, which follow as keywords; `lsmgeo.models.create` has presets.
+        settings: `R2N2Settings`, whose fields are also keywords; `lsmgeo.models.create` has presets.
 
     Shape:
         - images: (B, V, 3, H, W) in [0, 1], with H = W = `image_size`; cameras: B*V, view fastest; view_mask: (B, V).
@@ -206,7 +206,7 @@ class R2N2(VoxelModel):
 
     def __init__(self, settings: R2N2Settings = PAPER, **changes: Any) -> None:
         super().__init__()
-        settings = changed(settings, changes)
+        settings = replace_settings(settings, changes)
         self.settings = settings
         self.name = "r2n2-pose" if settings.pose else "r2n2"
         self.image_size = settings.image_size
@@ -241,9 +241,9 @@ class R2N2(VoxelModel):
 
         Args:
             images: (B, V, 3, H, W) in [0, 1].
-            cameras: B*V cameras, read with `pose` alone.
-            view_mask: (B, V) bool; views where it is False are not read, and what follows repeats what was before.
-            steps: after which views: None for all, "last", or their numbers.
+            cameras: B*V cameras, read only with `pose`.
+            view_mask: (B, V) bool; views where it is False are not read, and the answer before them is repeated.
+            steps: after which views: None for all, "last", or their indices.
 
         Returns:
             `VoxelOutput` with logits (B, S, D, H, W).
@@ -253,12 +253,12 @@ class R2N2(VoxelModel):
         """
         mask = self._check(images, view_mask)
         views = tuple(mask.shape)
-        after = chosen_steps(self.name, steps, views[1])
-        pictures = torch.where(mask[..., None, None, None], images, 0.0)
-        vectors = leaky_relu(self.vector(self.encoder(pictures.flatten(0, 1)).flatten(1))).unflatten(0, views)
+        after = views_used(self.name, steps, views[1])
+        images = torch.where(mask[..., None, None, None], images, 0.0)
+        vectors = leaky_relu(self.vector(self.encoder(images.flatten(0, 1)).flatten(1))).unflatten(0, views)
         if self.rotation is not None:
-            turned = self.rotation(self._quaternions(cameras, mask, images))
-            vectors = torch.cat((vectors, turned.to(vectors.dtype)), -1)
+            rotations = self.rotation(self._quaternions(cameras, mask, images))
+            vectors = torch.cat((vectors, rotations.to(vectors.dtype)), -1)
         states = self.recurrence(vectors, mask)[:, after]
         return VoxelOutput(self.decoder(states.flatten(0, 1)).unflatten(0, states.shape[:2]))
 
@@ -267,7 +267,7 @@ class R2N2(VoxelModel):
         return repr(self.settings)
 
     def _check(self, images: Tensor, view_mask: Tensor | None) -> Tensor:
-        """The mask of the views, all True where none is given."""
+        """Check images and mask; the mask, all True where none is given."""
         expected = f"(B, V, 3, {self.image_size}, {self.image_size}), the model's image size"
         check_float(self.name, "images", images, expected, 5)
         if tuple(images.shape[2:]) != (3, self.image_size, self.image_size) or images.shape[1] < 1:
@@ -280,7 +280,7 @@ class R2N2(VoxelModel):
         return view_mask
 
     def _quaternions(self, cameras: Cameras, mask: Tensor, images: Tensor) -> Tensor:
-        """(B, V, 4) as w, x, y, z; of masked views, whose cameras are not read, that of no rotation."""
+        """(B, V, 4) as w, x, y, z; of masked views, whose cameras are not read, the identity."""
         tensors = as_tensors(cameras, self.name)
         views, leading = tuple(mask.shape), tuple(tensors.cam_from_world.shape[:-2])
         if leading not in (views, (prod(views),)):
@@ -297,7 +297,7 @@ class R2N2(VoxelModel):
 
 
 def _initialise(module: nn.Module) -> None:
-    """As the original starts: normal weights of variance 4 / (inputs + outputs), shifts of 0.1."""
+    """As in the original: normal weights of variance 4 / (inputs + outputs), biases of 0.1."""
     if not isinstance(module, (nn.Linear, nn.Conv2d, nn.Conv3d, nn.ConvTranspose3d)):
         return
     nn.init.xavier_normal_(module.weight, sqrt(2))

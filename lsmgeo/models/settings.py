@@ -1,4 +1,4 @@
-"""Settings: frozen values that JSON can hold, checked when they are made; those of the two learnt stereo machines."""
+"""Settings: frozen values that JSON can hold, checked at construction; those of V-LSM and D-LSM."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 from lsmgeo._checks import describe
 from lsmgeo.errors import OptionError
 
-__all__ = ["DepthSettings", "MachineSettings", "VoxelSettings", "changed", "check_settings", "nearest"]
+__all__ = ["DepthSettings", "TrunkSettings", "VoxelSettings", "check_settings", "replace_settings", "suggestion"]
 
 LARGEST_SIDE = 4096
 LONGEST_LIST = 64
@@ -27,14 +27,14 @@ Limits = tuple[float, float]
 
 
 def check_settings(who: str, settings: Any, whole: Limits = (1, LARGEST_SIDE), **limits: Limits) -> None:
-    """Require that settings are of the types that they are annotated with, and within limits.
+    """Require that settings are of their annotated types and within limits.
 
-    Lists, as JSON has them, become tuples, and whole numbers real ones, where those are wanted.
+    Lists, as JSON has them, become tuples, and whole numbers real ones, where the annotation says so.
 
     Args:
         who: named in errors.
         settings: a dataclass whose fields are text, choices of it, flags, numbers, tuples, mappings or None.
-        whole: the least and the largest whole number, where `limits` say nothing else. Real numbers are positive.
+        whole: the least and the largest whole number, unless `limits` says otherwise. Real numbers are positive.
         limits: by the names of settings, the least and the largest number.
 
     Raises:
@@ -45,7 +45,7 @@ def check_settings(who: str, settings: Any, whole: Limits = (1, LARGEST_SIDE), *
         value, words = getattr(settings, item.name), str(item.type)
         least, most = limits.get(item.name) or (whole if "int" in words else (math.ulp(0.0), math.inf))
         try:
-            object.__setattr__(settings, item.name, _converted(value, kinds[item.name], least, most))
+            object.__setattr__(settings, item.name, _convert(value, kinds[item.name], least, most))
         except TypeError:
             if "..." in words:
                 words += f" of length 1 to {LONGEST_LIST}"
@@ -55,18 +55,18 @@ def check_settings(who: str, settings: Any, whole: Limits = (1, LARGEST_SIDE), *
             raise OptionError(f"{who}: {item.name} must be {words}; got {describe(value)}") from None
 
 
-def _converted(value: Any, kind: Any, least: float, most: float) -> Any:
-    """A value as a kind of setting; a TypeError where it is none."""
+def _convert(value: Any, kind: Any, least: float, most: float) -> Any:
+    """A value as a kind of setting; a TypeError where that is impossible."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (UnionType, Union):
         for one in inner:
             with contextlib.suppress(TypeError):
-                return _converted(value, one, least, most)
+                return _convert(value, one, least, most)
     elif origin is tuple and isinstance(value, (list, tuple)):
         if inner[-1] is Ellipsis and 1 <= len(value) <= LONGEST_LIST:
             inner = inner[:1] * len(value)
         if len(inner) == len(value) and Ellipsis not in inner:
-            return tuple(_converted(one, of, least, most) for one, of in zip(value, inner, strict=True))
+            return tuple(_convert(one, of, least, most) for one, of in zip(value, inner, strict=True))
     elif origin is collections.abc.Mapping and isinstance(value, Mapping):
         return dict(value)
     elif origin is Literal and isinstance(value, str) and value in inner:
@@ -80,37 +80,37 @@ def _converted(value: Any, kind: Any, least: float, most: float) -> Any:
     raise TypeError
 
 
-def nearest(name: object, known: Sequence[str]) -> str:
-    """What may have been meant by a name that there is not, for an error's end."""
+def suggestion(name: object, known: Sequence[str]) -> str:
+    """The end of an error about an unknown name: the closest known one, or all of them."""
     close = get_close_matches(str(name), known, 1)
     return f"; did you mean {close[0]}?" if close else f"; there are {', '.join(known)}"
 
 
 @dataclass(frozen=True)
-class MachineSettings:
-    """What both machines are built from. The defaults are the paper's.
+class TrunkSettings:
+    """The settings of what V-LSM and D-LSM share. The defaults are the paper's.
 
     Attributes:
         variant: "paper" or "release", see the models.
-        image_size: side of the square images in pixels that it is meant for; other sizes work.
+        image_size: side in pixels of the square images that it is meant for; other sizes work.
         grid_size: voxels along a side of the grid on which views are fused.
         encoder_channels: of the image encoder's levels, each of half the size of the one before.
         feature_channels: of the features that are unprojected.
         feature_stride: pixels of the image to a pixel of the features, a power of 2.
         lift: samples of the features along a side of a voxel, whose values become channels of that voxel: a cheap way
             to detail finer than the grid on which views are fused. Depth and direction are appended once a voxel.
-        fusion: "gru" or "lstm".
+        fusion: "gru" or "lstm", see `lsmgeo.fusion`, or "mean", "variance" or "max", which learn nothing.
         input_kernel: side in voxels of the recurrence's kernels over a view's features.
         state_kernel: of those over its state.
         hidden_channels: of the recurrence's state.
         grid_channels: of the grid network's levels; 64^3 grids take a fourth of 256.
         output_channels: of the grid network's last layer.
         pixel_rules: "exact", or "release" for the rules of the released code, which are off: pixel j of the features is
-            taken to lie at j times their stride, (stride - 1) / 2 pixels of the image aside; and of D-LSM alone, rays
-            of the swept maps pass the corners of pixels, and read voxels half a voxel back. What right geometry buys
-            is measured against it.
-        grid_skip: whether the fused grid itself goes beside it; neither the paper nor the release has this skip, which
-            small networks need: it is the one way for detail of the grid's own size.
+            taken to lie at j times their stride, (stride - 1) / 2 pixels of the image off; and in D-LSM only, rays
+            of the swept maps pass the corners of pixels, and read voxels half a voxel back. It shows what correct
+            geometry is worth.
+        grid_skip: whether the fused grid is appended to the grid network's output; neither the paper nor the release
+            has this skip, which small networks need: nothing else carries detail of the grid's own size.
     """
 
     variant: Literal["paper", "release"] = "paper"
@@ -120,7 +120,7 @@ class MachineSettings:
     feature_channels: int = 32
     feature_stride: int = 2
     lift: int = 1
-    fusion: Literal["gru", "lstm"] = "gru"
+    fusion: Literal["gru", "lstm", "mean", "variance", "max"] = "gru"
     input_kernel: int = 3
     state_kernel: int = 3
     hidden_channels: int = 32
@@ -134,6 +134,16 @@ class MachineSettings:
         """What the sides of images must be divisible by."""
         return 1 << len(self.encoder_channels)
 
+    @property
+    def volume_channels(self) -> int:
+        """Channels of a view's volume: samples of features, depth and, in the variant "paper", ray direction."""
+        return self.feature_channels * self.lift**3 + (1 if self.variant == "release" else 4)
+
+    @property
+    def fused_channels(self) -> int:
+        """Channels of the fused grid."""
+        return self.hidden_channels if self.fusion in ("gru", "lstm") else self.volume_channels
+
     def __post_init__(self) -> None:
         who = type(self).__name__
         kernels: dict[str, Limits] = {"input_kernel": (1, 15), "state_kernel": (1, 15)}
@@ -141,7 +151,7 @@ class MachineSettings:
         for name in kernels:
             if getattr(self, name) % 2 == 0:
                 raise OptionError(f"{who}: {name} must be odd; got {getattr(self, name)}")
-        # Maps of one pixel have no variance to be normalised by.
+        # Maps of one pixel have no variance to normalise by.
         if self.image_size % self.image_stride or self.image_size < 2 * self.image_stride:
             raise OptionError(
                 f"{who}: image_size must be a multiple of {self.image_stride}, 2 to the number of encoder_channels, "
@@ -163,8 +173,8 @@ class MachineSettings:
 
 
 @dataclass(frozen=True)
-class VoxelSettings(MachineSettings):
-    """What a `VoxelLSM` is built from: `MachineSettings`, and its own.
+class VoxelSettings(TrunkSettings):
+    """The settings of a `VoxelLSM`: `TrunkSettings` and its own.
 
     Attributes:
         upsample: voxels of the occupancy along a side of one of the grid's: a cheap way to a finer output.
@@ -179,18 +189,18 @@ class VoxelSettings(MachineSettings):
 
 
 @dataclass(frozen=True)
-class DepthSettings(MachineSettings):
-    """What a `DepthLSM` is built from: `MachineSettings`, and its own.
+class DepthSettings(TrunkSettings):
+    """The settings of a `DepthLSM`: `TrunkSettings` and its own.
 
     Attributes:
-        near: depth of the first plane that is swept, world units.
+        near: depth of the first plane of the sweep, world units.
         far: depth of the last.
-        planes: how many.
+        planes: how many there are.
         map_stride: pixels of the image to a pixel of the swept maps, a power of 2.
         projection: "nearest" or "trilinear".
-        ray_channels: of the two layers that reduce what lies along a ray; the release has the first alone.
-        skips: whether depth is made with the image encoder's early maps too; without, views that are no input can be
-            predicted.
+        ray_channels: of the two layers that reduce the features along a ray; the release has only the first.
+        skips: whether the depth layers read the image encoder's early maps too; without, the depth of views whose
+            images are not given can be predicted.
     """
 
     near: float = 1.0
@@ -213,7 +223,7 @@ class DepthSettings(MachineSettings):
             )
 
 
-def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:
+def replace_settings(settings: Settings, changes: Mapping[str, Any]) -> Settings:
     """Settings with changes.
 
     Args:
@@ -221,10 +231,10 @@ def changed(settings: Settings, changes: Mapping[str, Any]) -> Settings:
         changes: by name.
 
     Raises:
-        OptionError: an unknown name, or an impossible value.
+        OptionError: an unknown name, or an invalid value.
     """
     names = [item.name for item in fields(settings)]  # type: ignore[arg-type]
     for name in changes:
         if name not in names:
-            raise OptionError(f"{type(settings).__name__}: there is no setting {name!r}{nearest(name, names)}")
+            raise OptionError(f"{type(settings).__name__}: there is no setting {name!r}{suggestion(name, names)}")
     return replace(settings, **changes)  # type: ignore[type-var]

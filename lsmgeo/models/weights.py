@@ -1,6 +1,6 @@
-"""Weights of models in one file: safetensors, with the settings that the model is made from, and a checksum.
+"""Weights of models in one file: safetensors, with the model's settings and a checksum.
 
-Nothing in such a file is believed before it was checked: its header is bounded, and names, shapes, dtypes and count of
+Everything in such a file is checked before it is used: its header is bounded, and names, shapes, dtypes and count of
 its tensors are compared with those of the model that the settings describe before that model is allocated.
 """
 
@@ -52,7 +52,7 @@ __all__ = [
 # Where a run keeps its checkpoints: RUN/checkpoints/step_00000100/{model.safetensors, state.pt, meta.json}.
 CHECKPOINTS = "checkpoints"
 WEIGHTS = "model.safetensors"
-# ".old": a checkpoint that was about to be replaced when the process was killed.
+# ".old": a checkpoint that was being replaced when the process was killed.
 STEP = re.compile(r"step_(\d{8,18})(\.old-\d+)?")
 
 FORMAT = "lsmgeo-weights-1"
@@ -73,8 +73,8 @@ class Weights:
 
     Args:
         path: the file.
-        settings: what the model is made from.
-        about: notes of whoever wrote the file.
+        settings: of the model.
+        about: the notes kept with the weights.
         tensors: by the names of the model's ``state_dict``.
     """
 
@@ -87,20 +87,23 @@ class Weights:
 def write_weights(
     path: str | os.PathLike[str], model: nn.Module, *, about: Mapping[str, Any] | None = None, half: bool = False
 ) -> Path:
-    """Write a model to one file that `load` makes the model from, atomically.
+    """Write a model to one file, atomically; `load` reads it.
 
     Args:
-        path: the file, by custom ``.safetensors``.
-        model: from `create`.
+        path: the file, by convention ``.safetensors``.
+        model: from `create`. A model that `load` could not build from its settings (with an encoder or a layer of your
+            own, in float64, ...) is refused: save its ``state_dict`` with `torch.save`.
         about: notes to keep with the weights, in types that JSON has.
-        half: whether float32 weights are kept as float16, in half the space; `load` makes them float32 again.
+        half: whether float32 weights are kept as float16, in half the space; `load` converts them to float32.
 
     Returns:
         The path written.
 
     Raises:
         CheckpointError: the file cannot be written; nothing half-written stays.
-        OptionError: notes that JSON cannot hold; with `half`, a weight that overflows float16.
+        DTypeError: not a model of this library.
+        OptionError: a model that `load` could not read; notes that JSON cannot hold; with `half`, a weight that
+            overflows float16.
 
     Example:
         >>> import tempfile
@@ -117,7 +120,7 @@ def write_weights(
 
 
 def load(path: str | os.PathLike[str]) -> Model:
-    """Make a model from its weights.
+    """Build a model from its weights.
 
     Args:
         path: as for `read_weights`.
@@ -129,12 +132,7 @@ def load(path: str | os.PathLike[str]) -> Model:
         CheckpointError: there is no such file, it is damaged, or it does not hold what its settings describe.
     """
     weights = read_weights(path)
-    # Settings that a file does not live up to must not allocate what they describe.
-    with _WithoutMemory(), torch.random.fork_rng(devices=[]):
-        try:
-            model = from_settings(dict(weights.settings))
-        except (LsmGeoError, TypeError, ValueError, KeyError, RuntimeError) as error:
-            raise CheckpointError(weights.path, f"holds settings of no model ({str(error)[:400]})") from error
+    model = _build(weights)
     _check_fit(model, weights)
     dtypes = {name: tensor.dtype for name, tensor in model.state_dict().items()}
     model.load_state_dict(
@@ -145,11 +143,11 @@ def load(path: str | os.PathLike[str]) -> Model:
 
 
 def read_weights(path: str | os.PathLike[str]) -> Weights:
-    """Read and verify weights without making the model.
+    """Read and verify weights without building the model.
 
     Args:
         path: a file of `write_weights`; a checkpoint; or a run folder, for its newest checkpoint whose weights verify.
-            If that is not the newest that is there, a warning names both.
+            If that is not the newest one, a warning names both.
 
     Returns:
         Settings, notes and tensors.
@@ -169,19 +167,19 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
 
 
 class NewerFormatError(CheckpointError):
-    """No damage: falling back would throw a newer version's work away."""
+    """The file is not damaged: falling back to an older one would discard a newer version's work."""
 
 
 def newest_checkpoint(path: Path, read: Callable[[Path], Found], problems: Sequence[str] = ()) -> Found | None:
-    """The newest checkpoint of a run that can be read; if that is not the newest there is, a warning names both.
+    """The newest readable checkpoint of a run; if that is not the newest one, a warning names both.
 
     Args:
         path: a run folder or its folder of checkpoints.
         read: reads and verifies the checkpoint in a folder.
-        problems: what is known to be wrong already.
+        problems: problems that are already known.
 
     Returns:
-        What `read` gives, or None where nothing was ever saved.
+        What `read` returns, or None where nothing was ever saved.
 
     Raises:
         CheckpointError: there are checkpoints, and none verifies; or the newest is of a newer format.
@@ -224,7 +222,7 @@ def checkpoint_folders(path: Path) -> dict[int, Path]:
     """
     folder = path / CHECKPOINTS if (path / CHECKPOINTS).is_dir() else path
     found: dict[int, Path] = {}
-    # The longer names first: a checkpoint wins over the one that it replaces.
+    # The longer names first: a checkpoint takes precedence over the one that it replaces.
     for item in sorted(folder.glob("step_*"), key=lambda item: -len(item.name)):
         match = STEP.fullmatch(item.name)
         if match and item.is_dir():
@@ -244,9 +242,9 @@ def encode_weights(model: nn.Module, *, about: Mapping[str, Any] | None = None, 
         The content of a safetensors file.
 
     Raises:
-        OptionError: notes that JSON cannot hold; with `half`, a weight that overflows float16.
+        DTypeError, OptionError: see `write_weights`.
     """
-    tensors = tensors_of(model)
+    settings, tensors = settings_of(model), tensors_of(model)
     if check_flag("write_weights", "half", half):
         tensors = {name: tensor.half() if tensor.dtype == torch.float32 else tensor for name, tensor in tensors.items()}
         if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
@@ -255,13 +253,32 @@ def encode_weights(model: nn.Module, *, about: Mapping[str, Any] | None = None, 
         notes = json.dumps(dict(about or {}), allow_nan=False)
     except (TypeError, ValueError) as error:
         raise OptionError(f"write_weights: about must consist of what JSON has; {error}") from error
-    metadata = {"format": FORMAT, "settings": json.dumps(settings_of(model)), "about": notes}
+    _check_readable(model, Weights(Path(), settings, {}, tensors))
+    metadata = {"format": FORMAT, "settings": json.dumps(settings), "about": notes}
     metadata["sha256"] = checksum(metadata, tensors)
-    return safetensors.torch.save(tensors, metadata)
+    content = safetensors.torch.save(tensors, metadata)
+    if int.from_bytes(content[:8], "little") > MAX_HEADER_BYTES:
+        raise OptionError(f"write_weights: about must be shorter than {MAX_HEADER_BYTES} bytes as JSON")
+    return content
+
+
+def _check_readable(model: nn.Module, weights: Weights) -> None:
+    """Refuse a model that `load` could not build again from its settings."""
+    who = "write_weights: model must be one that load can build from its settings"
+    try:
+        loaded = _build(weights)
+        ours = dict(model.named_modules())
+        for name, module in loaded.named_modules():
+            if type(module) is not type(ours.get(name, module)):
+                mine, kind = type(ours[name]).__name__, type(module).__name__
+                raise OptionError(f"{who}; {name or 'it'} is of type {mine}, and load makes {kind}")
+        _check_fit(loaded, weights)
+    except CheckpointError as error:
+        raise OptionError(f"{who}; the file {error.reason}") from error
 
 
 def tensors_of(model: nn.Module) -> dict[str, Tensor]:
-    """Copies of a model's parameters and buffers by name, on the CPU, each contiguous."""
+    """Contiguous copies of a model's parameters and buffers by name, on the CPU."""
     return {name: tensor.detach().cpu().contiguous().clone() for name, tensor in model.state_dict().items()}
 
 
@@ -270,13 +287,13 @@ def parse_weights(content: bytes, path: Path) -> Weights:
 
     Args:
         content: the whole file.
-        path: where it came from, for messages.
+        path: its path, for messages.
 
     Returns:
         Settings, notes and tensors.
 
     Raises:
-        CheckpointError: it is no such file, or damaged.
+        CheckpointError: it is not such a file, or damaged.
     """
     length = int.from_bytes(content[:8], "little")
     if len(content) < 8 or length > min(len(content) - 8, MAX_HEADER_BYTES):
@@ -288,15 +305,15 @@ def parse_weights(content: bytes, path: Path) -> Weights:
             raise CheckpointError(path, f"is of format {metadata['format'][:64]!r}; this version reads {FORMAT!r}")
         if len(header) > MAX_TENSORS:
             raise CheckpointError(path, f"holds {len(header)} tensors, the limit is {MAX_TENSORS}")
-        # It refuses tensors that do not lie where their shapes say, one after the other to the end of the file.
+        # It refuses tensors whose bytes do not follow each other to the end of the file, as their shapes say.
         tensors = safetensors.torch.load(content)
         settings, about = json.loads(metadata["settings"]), json.loads(metadata["about"])
         if metadata.pop("sha256") != checksum(metadata, tensors):
             raise CheckpointError(path, "is damaged: its SHA-256 is not the one that was saved")
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise CheckpointError(path, f"is damaged, or no file of weights ({str(error)[:200]})") from error
+        raise CheckpointError(path, f"is damaged, or not a file of weights ({str(error)[:200]})") from error
     if not isinstance(settings, dict) or not isinstance(about, dict):
-        raise CheckpointError(path, "holds settings that are none")
+        raise CheckpointError(path, "holds invalid settings")
     return Weights(path, settings, about, tensors)
 
 
@@ -311,7 +328,7 @@ def read_file(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
         All of them.
 
     Raises:
-        CheckpointError: it is missing, no plain file, unreadable, or too large.
+        CheckpointError: it is missing, not a plain file, unreadable, or too large.
     """
     try:
         return read_bytes(path, limit)
@@ -323,11 +340,11 @@ def fill_model(model: nn.Module, weights: Weights) -> None:
     """Copy tensors into a model.
 
     Args:
-        model: to be filled.
+        model: to fill.
         weights: from `read_weights`.
 
     Raises:
-        CheckpointError: a tensor is missing, too many, or of another shape or dtype; the message names it.
+        CheckpointError: a tensor is missing, unknown, or of another shape or dtype; the message names it.
     """
     _check_fit(model, weights)
     model.load_state_dict(dict(weights.tensors))
@@ -337,8 +354,19 @@ def _read(path: Path) -> Weights:
     return parse_weights(read_file(path), path)
 
 
+def _build(weights: Weights) -> Model:
+    """The model that weights are of, whose parameters have no memory yet."""
+    # A file whose settings do not match its content must not allocate what they describe.
+    with _WithoutMemory(), torch.random.fork_rng(devices=[]):
+        try:
+            model = from_settings(dict(weights.settings))
+        except (LsmGeoError, TypeError, ValueError, KeyError, RuntimeError) as error:
+            raise CheckpointError(weights.path, f"holds settings of no model ({str(error)[:400]})") from error
+    return model
+
+
 class _WithoutMemory(TorchFunctionMode):
-    """Makes parameters of a shape alone, not all tensors as ``torch.device("meta")``, whose arithmetic loads sympy."""
+    """Parameters without memory; ``torch.device("meta")`` affects all tensors, and its arithmetic loads sympy."""
 
     def __torch_function__(
         self, func: Callable, types: Sequence[type], args: tuple = (), kwargs: Mapping[str, Any] | None = None
@@ -346,7 +374,7 @@ class _WithoutMemory(TorchFunctionMode):
         options = dict(kwargs or {})
         if func is torch.empty:
             options["device"] = "meta"
-        elif re.fullmatch("[a-z]\\w*_", getattr(func, "__name__", "")):  # gives a parameter its first values
+        elif re.fullmatch("[a-z]\\w*_", getattr(func, "__name__", "")):  # initialises a parameter
             target = args[0] if args else options["tensor"]
             if target.is_meta:
                 return target
@@ -359,7 +387,7 @@ def _check_fit(model: nn.Module, weights: Weights) -> None:
         if name not in weights.tensors:
             raise CheckpointError(weights.path, f"lacks {name}, {_describe(expected[name])}")
         if name not in expected:
-            raise CheckpointError(weights.path, f"holds {name}, which the model has not")
+            raise CheckpointError(weights.path, f"holds {name}, which the model does not have")
         want, have = _describe(expected[name]), _describe(weights.tensors[name])
         is_half = expected[name].dtype == torch.float32 and have == _describe(expected[name], torch.float16)
         if have != want and not is_half:
@@ -371,7 +399,7 @@ def _describe(tensor: Tensor, dtype: torch.dtype | None = None) -> str:
 
 
 def checksum(metadata: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
-    """SHA-256 of notes and tensors, contiguous and on the CPU, with their names, dtypes and shapes."""
+    """SHA-256 of metadata and of tensors, contiguous and on the CPU, with their names, dtypes and shapes."""
     digest = hashlib.sha256(json.dumps(dict(metadata), sort_keys=True).encode())
     for name, tensor in sorted(tensors.items()):
         digest.update(json.dumps([name, DTYPES[tensor.dtype], list(tensor.shape)]).encode())

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from lsmgeo._checks import describe
 from lsmgeo.data.read_files import read_text
 from lsmgeo.errors import DataError, OptionError
-from lsmgeo.models.settings import check_settings, nearest
+from lsmgeo.models.settings import check_settings, suggestion
 
 __all__ = ["DataConfig", "ModelConfig", "OptimiserConfig", "RunConfig", "TrainingConfig", "make_config", "read_config"]
 
@@ -327,4 +327,4 @@ def _parsed(text: str) -> Any:
 def _nearest(key: str, known: Sequence[str]) -> str:
     # The right name in the wrong group comes before a like one in the right group.
     near = [name for name in known if "." in key and name.rpartition(".")[2] == key.rpartition(".")[2]]
-    return f"; did you mean {near[0]}?" if near else nearest(key, known)
+    return f"; did you mean {near[0]}?" if near else suggestion(key, known)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.data import Batch, Sample
 from lsmgeo.metrics import DepthError, VoxelIoU
-from lsmgeo.models.blocks import evaluating
+from lsmgeo.models.blocks import evaluation_mode
 from lsmgeo.models.losses import sum_loss
 from lsmgeo.training.example_figures import Example
 from lsmgeo.training.launch import StopRequest, any_true, gather
@@ -87,7 +87,7 @@ def evaluate_model(
     measures: dict[int, Any] = {}
     total = count = 0.0
     examples: list[Example] = []
-    with evaluating(model):
+    with evaluation_mode(model):
         for batch in batches:
             if stop:
                 break

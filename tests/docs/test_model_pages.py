@@ -1,6 +1,7 @@
 """The pages of the models are made from the models, and the guides name what exists."""
 
 import ast
+import doctest
 import inspect
 import re
 import sys
@@ -128,6 +129,8 @@ def test_every_fault_is_a_test_that_exists():
 @pytest.mark.parametrize("page", PAGES)
 def test_pages_of_models_name_what_exists(page):
     text = PAGES[page]
+    examples = doctest.testfile(str(DOCS / "models" / f"{page}.rst"), module_relative=False)
+    assert (examples.attempted > 0, examples.failed) == (page == "index", 0)
     for block in re.findall(r"\.\. code-block:: python\n\n((?:   .*\n|\n)+)", text):
         ast.parse(re.sub(r"(?m)^   ", "", block))
     for name, preset, *variant in re.findall(r"\.\. model-layers:: ([\w-]+) (\w+)(?: (\w+))?", text):

@@ -116,8 +116,8 @@ def test_every_model_has_the_four_presets():
             r"encoder_channels must be tuple\[int, ...\] of length 1 to 64, from 1 to 4096; got tuple \(8, 0\)",
         ),
         (
-            lambda: create("voxel-lsm", preset="tiny", fusion="mean"),
-            r"fusion must be Literal\['gru', 'lstm'\]; got str 'mean'",
+            lambda: create("voxel-lsm", preset="tiny", fusion="median"),
+            r"fusion must be Literal\['gru', 'lstm', 'mean', 'variance', 'max'\]; got str 'median'",
         ),
         (lambda: create("voxel-lsm", preset="tiny", grid_skip=1), "grid_skip must be bool; got int 1"),
         (lambda: create("voxel-lsm", variant="release", upsample=2), "upsample must be 1 in the variant 'release'"),

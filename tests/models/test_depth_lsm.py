@@ -164,7 +164,7 @@ def test_views_that_are_no_input_can_be_predicted(free):
 
 def test_a_model_with_skips_predicts_its_inputs_alone(tiny):
     images, cameras = look(1, 2)
-    with pytest.raises(OptionError, match="make one with skips=False"):
+    with pytest.raises(OptionError, match="create it with skips=False"):
         tiny(images, cameras, target_cameras=cameras)
 
 

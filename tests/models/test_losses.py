@@ -124,7 +124,7 @@ def test_arguments_are_checked():
     with pytest.raises(ShapeError, match=r"as predicted, \(1, 2, 4, 4, 4\); got \(1, 8, 8, 8\)"):
         compute_loss(logits, batch(mask, occupancy=torch.zeros(1, 8, 8, 8, dtype=torch.bool)))
     given = batch(mask, occupancy=torch.zeros(1, 4, 4, 4, dtype=torch.bool))
-    with pytest.raises(ShapeError, match="output must be after 1 steps"):
+    with pytest.raises(ShapeError, match="output must be after 1 views"):
         compute_loss(logits, given, steps="last")
     with pytest.raises(OptionError, match="region must be one of"):
         compute_loss(logits, given, region="edge")

@@ -217,7 +217,7 @@ def test_a_lifted_volume_is_the_finer_one_cell_by_cell():
     torch.manual_seed(0)
     model = create("voxel-lsm", preset="tiny", lift=2, feature_channels=3, grid_size=8)
     features, cameras = torch.randn(1, 2, 3, 16, 16), look(1, 2)[1]
-    found = model._unproject(features, cameras, None)
+    found = model._unproject(features, cameras, None).volume
     fine, _ = Unproject(VoxelGrid(16))(features, cameras)
     rays, _ = Unproject(VoxelGrid(8), augment=("depth", "direction"))(features, cameras)
     assert found.shape == (1, 2, 3 * 8 + 4, 8, 8, 8)
@@ -240,7 +240,7 @@ def test_the_release_s_rule_takes_a_pixel_to_lie_at_j_times_the_stride():
     pixels = (seen[..., :2] / seen[..., 2:]).movedim(-1, 0)
     for rules, expected in (("release", pixels / 4), ("exact", (pixels + 0.5) / 4 - 0.5)):
         model = create("voxel-lsm", preset="tiny", feature_channels=2, feature_stride=4, pixel_rules=rules)
-        found = model._unproject(maps, cameras, None)[0, 0, :2].double()
+        found = model._unproject(maps, cameras, None).volume[0, 0, :2].double()
         inside = ((expected > 0) & (expected < 7)).all(0)
         assert int(inside.sum()) > 100
         torch.testing.assert_close(found[:, inside], expected[:, inside], rtol=0, atol=1e-4)

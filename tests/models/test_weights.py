@@ -171,27 +171,27 @@ def first(header: dict) -> dict:
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (lambda header: header.pop("__metadata__"), "is damaged, or no file of weights"),
-        (lambda header: header.update(__metadata__=[]), "is damaged, or no file of weights"),
-        (lambda header: header["__metadata__"].pop("format"), "is damaged, or no file of weights"),
+        (lambda header: header.pop("__metadata__"), "is damaged, or not a file of weights"),
+        (lambda header: header.update(__metadata__=[]), "is damaged, or not a file of weights"),
+        (lambda header: header["__metadata__"].pop("format"), "is damaged, or not a file of weights"),
         (lambda header: header["__metadata__"].update(format="lsmgeo-weights-2"), "is of format 'lsmgeo-weights-2'"),
-        (lambda header: header["__metadata__"].update(format=3), "is damaged, or no file of weights"),
-        (lambda header: header["__metadata__"].update(about=3), "is damaged, or no file of weights"),
+        (lambda header: header["__metadata__"].update(format=3), "is damaged, or not a file of weights"),
+        (lambda header: header["__metadata__"].update(about=3), "is damaged, or not a file of weights"),
         (lambda header: header["__metadata__"].pop("settings"), "is damaged"),
         (lambda header: header["__metadata__"].update(settings="{"), "is damaged"),
         (lambda header: header["__metadata__"].pop("sha256"), "is damaged"),
         (lambda header: header["__metadata__"].update(extra="x"), "is damaged"),
-        (lambda header: first(header).update(shape=[2**39, 2**39]), "is damaged, or no file of weights"),
-        (lambda header: first(header).update(shape=[-1]), "is damaged, or no file of weights"),
-        (lambda header: first(header).update(shape=[1.5]), "is damaged, or no file of weights"),
-        (lambda header: first(header).update(shape=[1] * 9), "is damaged, or no file of weights"),
-        (lambda header: first(header).update(shape=7), "is damaged, or no file of weights"),
-        (lambda header: first(header).update(dtype="F8_E5M2"), "is damaged, or no file of weights"),
-        (lambda header: first(header).update(dtype=[]), "is damaged, or no file of weights"),
-        (lambda header: first(header).update(data_offsets=[0, 2**39]), "is damaged, or no file of weights"),
-        (lambda header: header.update(twice=first(header)), "is damaged, or no file of weights"),
+        (lambda header: first(header).update(shape=[2**39, 2**39]), "is damaged, or not a file of weights"),
+        (lambda header: first(header).update(shape=[-1]), "is damaged, or not a file of weights"),
+        (lambda header: first(header).update(shape=[1.5]), "is damaged, or not a file of weights"),
+        (lambda header: first(header).update(shape=[1] * 9), "is damaged, or not a file of weights"),
+        (lambda header: first(header).update(shape=7), "is damaged, or not a file of weights"),
+        (lambda header: first(header).update(dtype="F8_E5M2"), "is damaged, or not a file of weights"),
+        (lambda header: first(header).update(dtype=[]), "is damaged, or not a file of weights"),
+        (lambda header: first(header).update(data_offsets=[0, 2**39]), "is damaged, or not a file of weights"),
+        (lambda header: header.update(twice=first(header)), "is damaged, or not a file of weights"),
         (lambda header: header.update({f"t{n}": first(header) for n in range(10_001)}), "the limit is 10000"),
-        (lambda header: header.update(more=3), "is damaged, or no file of weights"),
+        (lambda header: header.update(more=3), "is damaged, or not a file of weights"),
     ],
 )
 def test_a_header_that_lies_is_refused(path, content, change, match):
@@ -203,7 +203,7 @@ def test_a_header_that_lies_is_refused(path, content, change, match):
 @pytest.mark.parametrize("header", [b"", b"[]", b"null", b"{", b"[" * 100_000, b'{"a":' * 50_000, b"\xff\xfe", b"7"])
 def test_a_header_that_is_none_is_refused(path, header):
     path.write_bytes(joined(header, b""))
-    with pytest.raises(CheckpointError, match="is damaged, or no file of weights"):
+    with pytest.raises(CheckpointError, match="is damaged, or not a file of weights"):
         load(path)
 
 
@@ -211,7 +211,7 @@ def test_a_header_that_is_none_is_refused(path, header):
     ("change", "match"),
     [
         (lambda tensors: tensors.popitem(), r"lacks \S+, \("),
-        (lambda tensors: tensors.update(extra=torch.zeros(1)), "holds extra, which the model has not"),
+        (lambda tensors: tensors.update(extra=torch.zeros(1)), "holds extra, which the model does not have"),
         (
             lambda tensors: tensors.update({k: v[:1].clone() for k, v in [*tensors.items()][:1]}),
             r"as \(1,.*; the model has",
@@ -230,7 +230,7 @@ def test_tensors_that_do_not_fit_the_settings_are_refused_by_name(path, model, c
 @pytest.mark.parametrize(
     ("settings", "match"),
     [
-        ([], "holds settings that are none"),
+        ([], "holds invalid settings"),
         ({}, "holds settings of no model"),
         ({"name": "voxel-lsn"}, "holds settings of no model .*voxel-lsm"),
         ({"name": "voxel-lsm", "colour": "red"}, "holds settings of no model"),

@@ -137,6 +137,7 @@ OLD_NAMES = [
     ("lsmgeo.data", "Made", "SetResult"),
     ("lsmgeo.evaluation", "Contender", "Method"),
     ("lsmgeo.evaluation", "open_contenders", "open_methods"),
+    ("lsmgeo.models", "MachineSettings", "TrunkSettings"),
 ]
 
 

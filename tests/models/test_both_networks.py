@@ -1,4 +1,4 @@
-"""What holds for both machines: masked views reach nothing, and every weight learns."""
+"""What holds for V-LSM and D-LSM: masked views change nothing, and every weight learns."""
 
 from __future__ import annotations
 

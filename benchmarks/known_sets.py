@@ -60,8 +60,8 @@ def copy_chessboards(root: Path, scratch: Path) -> Path:
     return folder
 
 
-EPIPOLAR, OUTLINES = "epipolar error of matched features", "voxels inside the outlines"
-LSM = (Figure("depth points within a cell of the voxels", "99.9", "%", True), Figure(OUTLINES, "100.0", "%", True))
+EPIPOLAR, SILHOUETTES = "epipolar error of matched features", "voxels inside the silhouettes"
+LSM = (Figure("depth points within a cell of the voxels", "99.9", "%", True), Figure(SILHOUETTES, "100.0", "%", True))
 # Name, where it lies below the folder of sets or what makes it from that in a scratch folder, and what is known of it.
 SETS: tuple[tuple[str, str | Callable[[Path, Path], Path], tuple[Figure, ...]], ...] = (
     ("temple", "middlebury_temple", (Figure(EPIPOLAR, "0.16", "px"),)),
@@ -71,7 +71,7 @@ SETS: tuple[tuple[str, str | Callable[[Path, Path], Path], tuple[Figure, ...]], 
     ("HoloLens", "hololens_rgbd", (Figure("depth of one view in another", "0.3", "%"),)),
     ("LSM car", "lsm_sample/renders/02958343/*", LSM),
     ("LSM chair", "lsm_sample/renders/03001627/*", LSM),
-    ("R2N2 chair", "r2n2/chair", (Figure(OUTLINES, "99.5", "%", True),)),
+    ("R2N2 chair", "r2n2/chair", (Figure(SILHOUETTES, "99.5", "%", True),)),
     ("motorcycle", write_motorcycle, (Figure("image warped by depth", "3.0", "grey levels"),)),
     ("binvox", "binvox/*.binvox", (Figure("surface of the mesh in occupied voxels", "100.0", "%", True),)),
     ("chessboards", copy_chessboards, (Figure("rms of a stereo calibration from scratch", "0.217", "px"),)),

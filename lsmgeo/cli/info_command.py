@@ -1,4 +1,4 @@
-"""`lsmgeo info`: whether cameras and images belong together."""
+"""`lsmgeo info`: whether cameras and images are consistent."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ __all__ = ["info"]
 
 
 def info(path: str, out: str = "lsmgeo-info") -> int:
-    """Say what a path holds and whether its cameras and pictures belong together; name the likely mistake where not.
+    """Describe what a path holds, check that its cameras fit its images, and name the likely error if they do not.
 
     Args:
-        path: scene, calibration or voxels: a folder, or the file that is meant where a folder holds several.
-        out: folder for the pictures; created where it does not exist.
+        path: scene, calibration or voxels: a folder, or one of several files in it.
+        out: folder for the figures; created if it does not exist.
 
     Returns:
-        The exit status: 0 all is well, 1 it is not, 3 nothing could be measured (2 is for what cannot be read).
+        The exit status: 0 good, 1 bad, 3 nothing could be measured (2: the path cannot be read).
     """
     import time
 
@@ -43,5 +43,5 @@ def info(path: str, out: str = "lsmgeo-info") -> int:
     for what, file in written.items():
         print(f"{what + ':':<28}{file.resolve()}")
     if not written:
-        print(f"no pictures are drawn of {'voxels alone' if findings.kind == 'voxels' else 'a calibration'}")
+        print(f"no figures are drawn of {'voxels only' if findings.kind == 'voxels' else 'a calibration'}")
     return {"good": 0, "bad": 1, "unknown": 3}[findings.verdict]

@@ -1,4 +1,4 @@
-"""Whether cameras, photographs, depth and voxels belong together, and which mistake explains it where they do not."""
+"""Checks that cameras, images, depth and voxels are consistent, and the likely cause if they are not."""
 
 from lsmgeo.diagnosis.check_images import examine
 from lsmgeo.diagnosis.findings import Cause, Check, Findings

@@ -1,7 +1,8 @@
-"""A drawing of cameras and of what they saw, from above and from the side, in coordinates that can be read off."""
+"""A drawing of cameras and scene content from above and from the side, with coordinates."""
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,19 +19,19 @@ if TYPE_CHECKING:
 
 __all__ = ["Content", "draw_cameras", "surface_of"]
 
-# Up may be so far from an axis of the world, in degrees, for the world's own axes to be drawn.
+# Largest angle, degrees, between up and an axis of the world for which the axes of the world are used.
 LARGEST_TILT = 20.0
-# Frusta are this long, as a part of the way to the nearest other camera and of the whole; optical axes of them.
+# Length of frusta relative to the nearest other camera and to the whole scene; of optical axes relative to frusta.
 FRUSTUM, FRUSTUM_OF_ALL, SHORTEST, AXIS = 0.6, 0.12, 0.045, 1.8
-# Where optical axes meet: how different they must be, and how near to a point, as a part of the way there.
-LEAST_TURNED, NEAREST = 0.01, 0.2
-# Of numbers beside cameras, in points: their size, and places that are tried, as distances and turns from the back.
-LETTERS, DISTANCES, TURNS = 7, (8, 13, 19), (0, 35, -35, 70, -70)
-LIGHT = np.array([-0.4, 0.6, 0.7])  # to the right, up, and out of the paper
+# For a common point: the least spread of the optical axes, and their distance from it relative to its depth.
+LEAST_SPREAD, NEAREST = 0.01, 0.2
+# Numbers beside cameras: size and distances in points, and angles from the camera's back, degrees.
+FONT_SIZE, DISTANCES, ANGLES = 7, (8, 13, 19), (0, 35, -35, 70, -70)
+LIGHT = np.array([-0.4, 0.6, 0.7])  # right, up, towards the viewer
 
 
 class Content(NamedTuple):
-    """What cameras saw: points (N, 3), their colours (N, 3) or one, and of voxels their normals (N, 3) and side."""
+    """Scene content: points (N, 3), one colour or (N, 3); of voxels also their normals (N, 3) and size."""
 
     points: np.ndarray
     colours: np.ndarray | str = "0.45"
@@ -39,18 +40,18 @@ class Content(NamedTuple):
 
 
 class _View(NamedTuple):
-    """Rows: right, up on the paper, and out of it; where the origin of the axes is, and what they are called."""
+    """Axes of the drawing: rows right, up, towards the viewer; their origin, and the names of the first two."""
 
     system: np.ndarray
     origin: np.ndarray
     names: tuple[str, str]
 
-    def placed(self, points: np.ndarray) -> np.ndarray:
+    def project(self, points: np.ndarray) -> np.ndarray:
         return np.asarray((points - self.origin) @ self.system.T)
 
 
 def surface_of(voxels: Voxels) -> Content:
-    """The occupied voxels that have an empty neighbour, and the directions in which they are empty."""
+    """The occupied voxels that have an empty neighbour, with outward normals."""
     from scipy.ndimage import binary_erosion
 
     T = voxels.world_from_lattice
@@ -66,25 +67,25 @@ def draw_cameras(figure: Figure, cameras: Geometry, content: Content, sizes: np.
     """Draw cameras from above and from the side.
 
     Args:
-        figure: to draw in.
-        cameras: of which.
-        content: what they saw.
-        sizes: (V, 2) height and width of the photographs.
+        figure: the figure to draw in.
+        cameras: the cameras.
+        content: the content of the scene.
+        sizes: (V, 2) height and width of the images.
         colours: (V, 3) of the cameras.
     """
-    above, aside, told = _views(cameras)
-    words = f"thick: the upper side of the picture; dotted: the optical axis; {told}"
+    above, side, coordinates = _views(cameras)
+    words = f"thick: the upper side of the image; dotted: the optical axis; {coordinates}"
     figure.supxlabel(words, fontsize=9)
-    panels = list(zip(figure.subplots(1, 2), (above, aside), ("from above", "from the side"), strict=True))
-    length, meeting = _frustum_length(cameras.centers, content.points), _common_point(cameras)
+    panels = list(zip(figure.subplots(1, 2), (above, side), ("from above", "from the side"), strict=True))
+    length, common = _frustum_length(cameras.centers, content.points), _common_point(cameras)
     for axes, view, name in panels:
         axes.set_title(f"{counted(len(cameras.K), 'cameras')} {name}")
         places = _draw_frusta(axes, cameras, view, sizes, colours, length)
-        seen = view.placed(content.points)[:, :2]
-        if len(seen):
-            places = np.concatenate([places, np.percentile(seen, (0, 100) if content.cell else (2, 98), axis=0)])
-        if meeting is not None:
-            places = np.concatenate([places, view.placed(meeting)[None, :2]])
+        shown = view.project(content.points)[:, :2]
+        if len(shown):
+            places = np.concatenate([places, np.percentile(shown, (0, 100) if content.cell else (2, 98), axis=0)])
+        if common is not None:
+            places = np.concatenate([places, view.project(common)[None, :2]])
         low, high = places.min(0), places.max(0)
         margin = 0.1 * float((high - low).max()) + 1e-12
         axes.set_xlim(low[0] - margin, high[0] + margin)
@@ -92,12 +93,12 @@ def draw_cameras(figure: Figure, cameras: Geometry, content: Content, sizes: np.
         axes.set_aspect("equal")
         axes.tick_params(labelsize=7)
         _name_axes(axes, view)
-        _mark(axes, meeting, view)
-    # Sizes of voxels and places of numbers are told on paper, whose scale is known when all is laid out.
+        _mark_points(axes, common, view)
+    # Sizes of voxels and places of numbers are in points, so they need the final layout.
     figure.draw_without_rendering()
     for axes, view, _ in panels:
         _draw_content(axes, content, view)
-        _number(axes, cameras, view)
+        _number_cameras(axes, cameras, view)
 
 
 def _views(cameras: Geometry) -> tuple[_View, _View, str]:
@@ -106,24 +107,24 @@ def _views(cameras: Geometry) -> tuple[_View, _View, str]:
     if abs(up[axis]) >= np.cos(np.radians(LARGEST_TILT)):
         up = np.sign(up[axis]) * np.eye(3)[axis]
         right, origin = np.eye(3)[1 if axis == 0 else 0], np.zeros(3)
-        told = "coordinates of the world"
+        coordinates = "coordinates of the world"
     else:
         right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
         right, origin = right / np.linalg.norm(right), cameras.centers.mean(0)
-        told = "turned so that up is up; origin at the middle of the cameras; lengths of the world"
+        coordinates = "rotated so that up is up; origin at the mean of the cameras; lengths of the world"
     back = np.cross(up, right)
     world = not origin.any() and bool(np.isin(np.abs(up), (0, 1)).all())
 
-    def name(direction: np.ndarray, turned: str) -> str:
-        return f"{'xyz'[np.argmax(np.abs(direction))]} (world)" if world else turned
+    def name(direction: np.ndarray, other: str) -> str:
+        return f"{'xyz'[np.argmax(np.abs(direction))]} (world)" if world else other
 
     across, deep, high = name(right, "across"), name(back, "away"), name(up, "up")
     above = _View(np.stack([right, back, up]), origin, (across, deep))
-    return above, _View(np.stack([right, up, -back]), origin, (across, high)), told
+    return above, _View(np.stack([right, up, -back]), origin, (across, high)), coordinates
 
 
 def _up(cameras: Geometry) -> np.ndarray:
-    """The normal of the ring that cameras make around something, or else the mean of their own up."""
+    """The normal of the ring of cameras around an object, or else the mean of their own up directions."""
     up = -cameras.R[:, 1].mean(0)
     if np.linalg.norm(up) < 0.2:
         up = -cameras.R[0, 1]
@@ -135,7 +136,7 @@ def _up(cameras: Geometry) -> np.ndarray:
 
 
 def _name_axes(axes: Axes, view: _View) -> None:
-    """Names, and numbers of the world also where its axis runs to the left or down."""
+    """Label the axes; numbers are those of the world even if its axis points left or down."""
     axes.set_xlabel(view.names[0], fontsize=8)
     axes.set_ylabel(view.names[1], fontsize=8)
     for axis, direction, name in zip((axes.xaxis, axes.yaxis), view.system[:2], view.names, strict=True):
@@ -146,10 +147,10 @@ def _name_axes(axes: Axes, view: _View) -> None:
 def _draw_frusta(
     axes: Axes, cameras: Geometry, view: _View, sizes: np.ndarray, colours: np.ndarray, length: float
 ) -> np.ndarray:
-    """Draw pyramids; all their points on the paper, (N, 2)."""
+    """Draw the frusta, and return all their points in the drawing, (N, 2)."""
     from matplotlib.collections import LineCollection
 
-    placed = view.placed(cameras.centers)
+    placed = view.project(cameras.centers)
     places = [placed[:, :2]]
     for camera, colour in enumerate(colours):
         height, width = sizes[camera]
@@ -167,12 +168,12 @@ def _draw_frusta(
     return np.concatenate(places)
 
 
-def _mark(axes: Axes, meeting: np.ndarray | None, view: _View) -> None:
-    """The world's origin, and the point where the optical axes meet, where they are in the drawing."""
+def _mark_points(axes: Axes, common: np.ndarray | None, view: _View) -> None:
+    """Mark the origin of the world and the common point of the optical axes, if they are inside the drawing."""
     marks = [("+", 9, "origin of the world", np.zeros(3))]
-    marks += [] if meeting is None else [("o", 4, "where the optical axes meet", meeting)]
+    marks += [] if common is None else [("o", 4, "common point of the optical axes", common)]
     for sign, size, name, point in marks:
-        x, y, _ = view.placed(point)
+        x, y, _ = view.project(point)
         (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
         if left < x < right and low < y < high:
             axes.plot(x, y, sign, color="black", markersize=size, label=name, linestyle="none", zorder=5)
@@ -181,39 +182,39 @@ def _mark(axes: Axes, meeting: np.ndarray | None, view: _View) -> None:
 
 
 def _common_point(cameras: Geometry) -> np.ndarray | None:
-    """The point nearest to all optical axes, if it is near to them and before most cameras."""
+    """The point nearest to all optical axes, if it is close to them and in front of most cameras."""
     directions = np.linalg.inv(cameras.R)[:, :, 2]
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     across = np.eye(3) - directions[:, :, None] * directions[:, None]
     total = across.mean(0)
-    if np.linalg.eigvalsh(total)[0] < LEAST_TURNED:
+    if np.linalg.eigvalsh(total)[0] < LEAST_SPREAD:
         return None
     point = np.linalg.solve(total, np.einsum("vij,vj->i", across, cameras.centers) / len(across))
     to = point - cameras.centers
-    aside = np.linalg.norm(np.einsum("vij,vj->vi", across, to), axis=1)
+    away = np.linalg.norm(np.einsum("vij,vj->vi", across, to), axis=1)
     along = (to * directions).sum(1)
-    return np.asarray(point) if np.median(aside) < NEAREST * np.median(along) else None
+    return np.asarray(point) if np.median(away) < NEAREST * np.median(along) else None
 
 
 def _draw_content(axes: Axes, content: Content, view: _View) -> None:
-    seen = view.placed(content.points)
-    order = np.argsort(seen[:, 2], kind="stable")
+    placed = view.project(content.points)
+    order = np.argsort(placed[:, 2], kind="stable")
     if not len(order):
         return
     if content.normals is None:
         shown = content.colours if isinstance(content.colours, str) else content.colours[order]
-        axes.scatter(seen[order, 0], seen[order, 1], c=shown, s=3, linewidths=0, zorder=0.5)
+        axes.scatter(placed[order, 0], placed[order, 1], c=shown, s=3, linewidths=0, zorder=0.5)
         return
-    # Of voxels before each other only the foremost is seen.
-    bins = np.round(seen[:, :2] / (0.5 * content.cell)).astype(int)
+    # Only the foremost of overlapping voxels is visible.
+    bins = np.round(placed[:, :2] / (0.5 * content.cell)).astype(int)
     order = order[::-1][np.unique(bins[order[::-1]], axis=0, return_index=True)[1]]
-    order = order[np.argsort(seen[order, 2], kind="stable")]
-    near = (seen[order, 2] - seen[:, 2].min()) / max(float(np.ptp(seen[:, 2])), 1e-12)
+    order = order[np.argsort(placed[order, 2], kind="stable")]
+    near = (placed[order, 2] - placed[:, 2].min()) / max(float(np.ptp(placed[:, 2])), 1e-12)
     lit = np.maximum(content.normals[order] @ view.system.T @ (LIGHT / np.linalg.norm(LIGHT)), 0)
     grey = np.clip(0.3 + 0.35 * lit + 0.3 * near, 0, 1)
     side = _points_per_unit(axes) * content.cell * (1.1 if "(world)" in view.names[0] else 1.4)
     shades = grey[:, None] * np.array([0.92, 0.97, 1.0])
-    axes.scatter(seen[order, 0], seen[order, 1], c=shades, s=side**2, marker="s", linewidths=0, zorder=0.5)
+    axes.scatter(placed[order, 0], placed[order, 1], c=shades, s=side**2, marker="s", linewidths=0, zorder=0.5)
 
 
 def _points_per_unit(axes: Axes) -> float:
@@ -221,34 +222,34 @@ def _points_per_unit(axes: Axes) -> float:
     return float((right - left) * 72 / axes.figure.dpi)
 
 
-def _number(axes: Axes, cameras: Geometry, view: _View) -> None:
-    """Numbers behind the cameras; one that finds no place free of others is left out."""
+def _number_cameras(axes: Axes, cameras: Geometry, view: _View) -> None:
+    """Write numbers behind the cameras; a number without a free place is left out."""
     from matplotlib.patheffects import withStroke
 
-    placed = view.placed(cameras.centers)[:, :2]
+    placed = view.project(cameras.centers)[:, :2]
     points = placed * _points_per_unit(axes)
     back = -(np.linalg.inv(cameras.R)[:, :, 2] @ view.system.T)[:, :2]
-    outline = [withStroke(linewidth=2, foreground="white")]
+    stroke = [withStroke(linewidth=2, foreground="white")]
     written: list[tuple[np.ndarray, float]] = []
     for camera, direction in enumerate(back):
         length = np.linalg.norm(direction)
         straight = direction / length if length > 0.05 else np.array([0.0, 1.0])
-        width = 0.62 * LETTERS * len(str(camera))
-        for distance, turn in ((distance, turn) for distance in DISTANCES for turn in TURNS):
-            c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+        width = 0.62 * FONT_SIZE * len(str(camera))
+        for distance, angle in itertools.product(DISTANCES, ANGLES):
+            c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
             offset = distance * np.array([c * straight[0] - s * straight[1], s * straight[0] + c * straight[1]])
             place = points[camera] + offset
-            apart = [np.abs(place - other) / [(width + wide) / 2 + 1, LETTERS] for other, wide in written]
+            apart = [np.abs(place - other) / [(width + wide) / 2 + 1, FONT_SIZE] for other, wide in written]
             if all(gap.max() > 1 for gap in apart):
                 axes.annotate(
                     str(camera),
                     placed[camera],
                     (float(offset[0]), float(offset[1])),
                     textcoords="offset points",
-                    fontsize=LETTERS,
+                    fontsize=FONT_SIZE,
                     ha="center",
                     va="center",
-                    path_effects=outline,
+                    path_effects=stroke,
                     zorder=6,
                 )
                 written.append((place, width))
@@ -256,7 +257,7 @@ def _number(axes: Axes, cameras: Geometry, view: _View) -> None:
 
 
 def _frustum_length(centers: np.ndarray, content: np.ndarray) -> float:
-    """So long that neighbours hardly overlap and all are seen."""
+    """A length at which neighbours hardly overlap and all are visible."""
     everything = np.concatenate([centers, content])
     low, high = np.percentile(everything, (2, 98), axis=0)
     whole = float(np.linalg.norm(high - low))

@@ -1,4 +1,4 @@
-"""Mistakes that people make with cameras, each with the correction that would undo it."""
+"""Common errors in cameras and depth, each with its correction: pose conventions, resolution of K, units of depth."""
 
 from __future__ import annotations
 
@@ -14,43 +14,43 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 __all__ = [
-    "Candidate", "camera_candidates", "depth_candidates", "depth_scaled", "focal_scaled", "resolution_candidates",
-    "scaled",
+    "FLIP", "OPENGL", "Candidate", "camera_candidates", "depth_candidates", "depth_scaled", "focal_scaled",
+    "resolution_candidates", "scaled",
 ]  # fmt: skip
 
 DIRECTIONS = (("right", "left"), ("down", "up"), ("forward", "back"))
 OPENGL = np.diag([1.0, -1.0, -1.0])
 FLIP = np.diag([1.0, -1.0, 1.0])
-# Scales between which K of another resolution is sought; the search refines what is best.
+# Scales of K that are searched; the best one is refined.
 SCALES = np.geomspace(1 / 8, 8, 31)
 UNITS = (1000.0, 100.0, 10.0, 5.0, 25.4, 2.54, 4.0, 2.0, 256.0)
 
 
 class Candidate(NamedTuple):
-    """A mistake that may have been made.
+    """A possible error.
 
     Attributes:
-        name: the mistake's short name.
-        corrected: how the correction is told, such as "inverted".
+        name: the error's short name.
+        correction: the correction in words, such as "inverted".
         remedy: what to do, one sentence.
-        hypothesis: the geometry with the mistake undone.
+        hypothesis: the corrected geometry.
     """
 
     name: str
-    corrected: str
+    correction: str
     remedy: str
     hypothesis: Hypothesis
 
 
 def camera_candidates(stated: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
-    """Mistakes that concern every camera alike, common ones first.
+    """Errors that affect all cameras alike, common ones first.
 
     Args:
-        stated: the cameras as they are.
-        sizes: (V, 2) height and width of the photographs.
+        stated: the cameras that the scene states.
+        sizes: (V, 2) height and width of the images.
     """
     inverse = (
-        "The poses are camera-to-world where world-to-camera is meant: invert the 4 x 4 matrices "
+        "The poses are camera-to-world and are used as world-to-camera: invert the 4 x 4 matrices "
         "(R^T and -R^T t), or read them as camera-to-world."
     )
     opengl = (
@@ -60,36 +60,36 @@ def camera_candidates(stated: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
     flipped = "y points the other way: {}."
     table: list[tuple[str, str, str, Callable[[Geometry], Geometry]]] = [
         ("poses inverted", "inverted", inverse, _inverted),
-        ("OpenGL axes", "with y and z negated", opengl, lambda cameras: _turned(cameras, OPENGL)),
+        ("OpenGL axes", "with y and z negated", opengl, lambda cameras: _rotated(cameras, OPENGL)),
         (
             "y flipped",
             "with the cameras' and the world's y negated",
             flipped.format("negate it in the cameras and in the world, which is left-handed here"),
-            lambda cameras: _turned(cameras._replace(R=cameras.R @ FLIP), FLIP),
+            lambda cameras: _rotated(cameras._replace(R=cameras.R @ FLIP), FLIP),
         ),
         (
             "y flipped",
-            "with the photographs upside down",
-            flipped.format("the rows of the photographs are stored from the bottom up; flip them"),
+            "with the images upside down",
+            flipped.format("the rows of the images are stored from the bottom up; flip them"),
             lambda cameras: _flipped(cameras, sizes, 1),
         ),
         (
             "y flipped",
             "with the cameras' y negated",
             flipped.format("negate the second row of world-to-camera"),
-            lambda cameras: _turned(cameras, FLIP),
+            lambda cameras: _rotated(cameras, FLIP),
         ),
         (
             "poses inverted and OpenGL axes",
             "inverted, then with y and z negated",
             f"{inverse} {opengl}",
-            lambda cameras: _turned(_inverted(cameras), OPENGL),
+            lambda cameras: _rotated(_inverted(cameras), OPENGL),
         ),
         (
             "poses inverted and OpenGL axes",
             "with y and z negated, then inverted",
             f"{opengl} {inverse}",
-            lambda cameras: _inverted(_turned(cameras, OPENGL)),
+            lambda cameras: _inverted(_rotated(cameras, OPENGL)),
         ),
         (
             "rotation transposed",
@@ -100,7 +100,7 @@ def camera_candidates(stated: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
         (
             "centre taken as translation",
             "with t = -R C",
-            "What is taken for the translation is the camera's centre C: t is -R C.",
+            "The camera centre C is used as the translation: t is -R C.",
             lambda cameras: cameras._replace(t=-np.einsum("vij,vj->vi", cameras.R, cameras.t)),
         ),
         (
@@ -111,48 +111,48 @@ def camera_candidates(stated: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
         ),
         (
             "x flipped",
-            "with the photographs mirrored",
-            "The photographs are mirrored left to right, or the cameras' x points left: mirror them back.",
+            "with the images mirrored",
+            "The images are mirrored left to right, or the cameras' x points left: mirror them back.",
             lambda cameras: _flipped(cameras, sizes, 0),
         ),
     ]
     found = [Candidate(*row[:3], _both(stated, row[3])) for row in table]
-    for turn, words in _other_axes():
+    for rotation, words in _other_axes():
         remedy = f"The cameras' x, y, z axes point {words}: bring them to right, down, forward."
-        turned = _both(stated, partial(_turned, turn=turn))
-        both = _both(stated, lambda cameras, turn=turn: _turned(_inverted(cameras), turn))  # type: ignore[misc]
-        found.append(Candidate("other camera axes", f"with axes {words}", remedy, turned))
+        rotated = _both(stated, partial(_rotated, rotation=rotation))
+        both = _both(stated, lambda cameras, R=rotation: _rotated(_inverted(cameras), R))  # type: ignore[misc]
+        found.append(Candidate("other camera axes", f"with axes {words}", remedy, rotated))
         found.append(Candidate("other camera axes", f"inverted, with axes {words}", f"{inverse} {remedy}", both))
     return found
 
 
 def resolution_candidates(stated: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
-    """K of photographs of another size: by powers of two, and by what would centre the principal points."""
-    middles = (np.median(sizes[:, ::-1], axis=0) / 2) / (np.median(stated.photographs.K[:, :2, 2], axis=0) + 0.5)
+    """K of images of another size: factors that are powers of two, and those that centre the principal points."""
+    middles = (np.median(sizes[:, ::-1], axis=0) / 2) / (np.median(stated.cameras.K[:, :2, 2], axis=0) + 0.5)
     hints = [middles, np.full(2, middles.mean())] if (middles > 0.05).all() and (middles < 20).all() else []
     factors = [*(np.full(2, 2.0**power) for power in (-1, 1, -2, 2, -3, 3)), *hints]
     return [scaled(stated, factor) for factor in factors if np.abs(np.log(factor)).max() > 0.02]
 
 
 def scaled(stated: Hypothesis, factor: np.ndarray) -> Candidate:
-    """All of K multiplied, with half-integer pixel centres, by (2,) factors along x and y."""
-    told = f"{factor[0]:.4g}"
+    """K resized by (2,) factors along x and y."""
+    text = f"{factor[0]:.4g}"
     if not np.isclose(factor[0], factor[1], rtol=1e-3):
-        told += f" along x, {factor[1]:.4g} along y"
+        text += f" along x, {factor[1]:.4g} along y"
     remedy = (
-        f"K belongs to photographs of another size: multiply fx and cx, fy and cy by {told} "
-        "(lsmgeo.cameras.resize keeps the half pixel right), or use the photographs of K's size."
+        f"K belongs to images of another size: multiply fx and cx, fy and cy by {text} "
+        "(lsmgeo.cameras.resize keeps the half pixel right), or use the images of K's size."
     )
     changed = _both(stated, lambda cameras: cameras._replace(K=scaling(*factor) @ cameras.K))
-    return Candidate("K of another resolution", f"with K times {told}", remedy, changed)
+    return Candidate("K of another resolution", f"with K times {text}", remedy, changed)
 
 
 def focal_scaled(stated: Hypothesis, scale: float) -> Candidate:
-    """Focal lengths multiplied, while the principal points are right."""
+    """Focal lengths multiplied; the principal points stay."""
     factor = np.array([[scale, scale, 1.0]] * 2 + [[1.0, 1.0, 1.0]])
-    remedy = f"The focal lengths are off by a factor of {scale:.4g}: check angles, units and which side is meant"
-    # Both bend the same rays; far from 1, no principal point would do it.
-    remedy += "." if abs(np.log(scale)) > 0.2 else "; or it is the principal points that are off."
+    remedy = f"The focal lengths are off by a factor of {scale:.4g}: check units, and width against height"
+    # Near 1, shifted principal points have nearly the same effect; far from 1 they have not.
+    remedy += "." if abs(np.log(scale)) > 0.2 else "; or the principal points are off."
     changed = _both(stated, lambda cameras: cameras._replace(K=cameras.K * factor))
     return Candidate("focal length off", f"with focal lengths times {scale:.4g}", remedy, changed)
 
@@ -160,33 +160,33 @@ def focal_scaled(stated: Hypothesis, scale: float) -> Candidate:
 def depth_scaled(stated: Hypothesis, scale: float) -> Candidate:
     """Depth multiplied."""
     remedy = f"Depth and translations are in different units: multiply depth by {scale:.4g}."
-    corrected = f"with depth times {scale:.4g}"
-    return Candidate("depth in other units", corrected, remedy, stated._replace(depth_scale=scale))
+    correction = f"with depth times {scale:.4g}"
+    return Candidate("depth in other units", correction, remedy, stated._replace(depth_scale=scale))
 
 
 def depth_candidates(stated: Hypothesis) -> list[Candidate]:
-    """Depth along the ray, and depth in other units that are common."""
-    along = "Depth is the distance along the ray: divide it by the length of K^-1 (x, y, 1), which makes it camera z."
+    """Depth along the ray, and depth in other common units."""
+    along = "Depth is the distance along the ray: divide it by the length of K^-1 (x, y, 1) to get camera z."
     found = Candidate("depth along the ray", "along the ray", along, stated._replace(along_ray=True))
     return [found, *(depth_scaled(stated, scale) for scale in (*UNITS, *(1 / unit for unit in UNITS)))]
 
 
 def _both(stated: Hypothesis, change: Callable[[Geometry], Geometry]) -> Hypothesis:
-    photographs = change(stated.photographs)
-    beside = photographs if stated.beside is stated.photographs else change(stated.beside)
-    return stated._replace(photographs=photographs, beside=beside)
+    cameras = change(stated.cameras)
+    depth_cameras = cameras if stated.depth_cameras is stated.cameras else change(stated.depth_cameras)
+    return stated._replace(cameras=cameras, depth_cameras=depth_cameras)
 
 
 def _inverted(cameras: Geometry) -> Geometry:
     return cameras._replace(R=np.linalg.inv(cameras.R), t=cameras.centers)
 
 
-def _turned(cameras: Geometry, turn: np.ndarray) -> Geometry:
-    return cameras._replace(R=turn @ cameras.R, t=cameras.t @ turn.T)
+def _rotated(cameras: Geometry, rotation: np.ndarray) -> Geometry:
+    return cameras._replace(R=rotation @ cameras.R, t=cameras.t @ rotation.T)
 
 
 def _flipped(cameras: Geometry, sizes: np.ndarray, axis: int) -> Geometry:
-    """Cameras of photographs that are mirrored along x (0) or y (1)."""
+    """Cameras of images that are mirrored along x (0) or y (1)."""
     K = cameras.K.copy()
     K[:, axis] *= -1
     K[:, axis, 2] += sizes[:, 1 - axis] - 1
@@ -194,14 +194,14 @@ def _flipped(cameras: Geometry, sizes: np.ndarray, axis: int) -> Geometry:
 
 
 def _other_axes() -> list[tuple[np.ndarray, str]]:
-    """Turns between right-handed systems of camera axes, except those that have names of their own."""
+    """Rotations from other right-handed camera axes to ours, except those that have a name, with the axes in words."""
     found = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
-            # Column i is where the file's axis i points, in ours.
-            turn = np.zeros((3, 3))
-            turn[list(order), range(3)] = signs
-            if np.linalg.det(turn) > 0 and not (np.array_equal(turn, np.eye(3)) or np.array_equal(turn, OPENGL)):
+            # Column i is the file's axis i in our axes.
+            rotation = np.zeros((3, 3))
+            rotation[list(order), range(3)] = signs
+            if np.linalg.det(rotation) > 0 and not any(np.array_equal(rotation, R) for R in (np.eye(3), OPENGL)):
                 words = ", ".join(DIRECTIONS[axis][int(sign < 0)] for axis, sign in zip(order, signs, strict=True))
-                found.append((turn, words))
+                found.append((rotation, words))
     return found

@@ -1,4 +1,4 @@
-"""Whether voxels lie where the mesh beside them does."""
+"""Voxels compared with the mesh they were made from: placement, order and direction of the axes."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ __all__ = ["examine_voxels"]
 
 SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
 USUAL_STEMS = ("model", "model_normalized")
-# Points on the surface; a surface through 128^3 voxels meets some tens of thousands of them.
+# Points on the surface; a surface in a 128^3 grid passes through some tens of thousands of voxels.
 SAMPLES = 100_000
 SEED = 0
-# Sampled in single precision or written with few digits, a point on the box's own side lies outside by rounding.
+# With rounding, points on the faces of the grid's box may be outside it.
 TOLERANCE = 1e-4
 INSIDE = 0.98
-# Carving leaves walls inside that no surface explains, in small number.
+# Carving leaves a few inner walls without a surface.
 AT_SURFACE = 0.8
-# An alternative must explain that much more than what was read.
+# An alternative must fit better by this much.
 CLEARLY = 0.02
 
 
-class _Placed(NamedTuple):
+class _PlacedVoxels(NamedTuple):
     """Occupancy in x, y, z, in an axis-aligned box."""
 
     occupied: np.ndarray  # (W, H, D) bool
@@ -43,50 +43,49 @@ class _Placed(NamedTuple):
 
 
 def examine_voxels(voxels: Voxels, path: str | Path) -> Findings:
-    """Examine voxels, against the mesh that lies beside them where there is one.
+    """Compare voxels with the mesh beside them.
 
-    Every point of a surface lies in an occupied voxel, and the outermost occupied voxels lie at the surface. Where that
-    fails, the other placement of binvox files and all orders and directions of the axes are tried.
+    Every point of the surface is in an occupied voxel, and the outermost occupied voxels are at the surface. If not,
+    the other placement of binvox files and all orders and directions of the axes are tried.
 
     Args:
-        voxels: as a reader gave them.
-        path: the file that they came from, or its folder: a mesh is sought beside it, of the same name, else
-            ``model.*``, else the only one.
+        voxels: as a reader returned them.
+        path: their file, or its folder; the mesh beside it has the same name, else ``model.*``, else is the only one.
 
     Returns:
-        The findings; "unknown" where no mesh lies beside.
+        The findings; "unknown" without a mesh.
     """
     path = Path(path)
-    placed = _placed(voxels)
+    placed = _place(voxels)
     facts = _facts(placed)
     try:
         mesh_file = _find_mesh(path)
         mesh = None if mesh_file is None else load_mesh(mesh_file)
     except DataError as error:
-        gap = Gap(f"the mesh beside cannot be read: {error}", "Mend that file, or put another mesh in its place.")
+        gap = Gap(f"the mesh beside the voxels cannot be read: {error}", "Repair that file, or replace it.")
         return Findings(facts, (), None, (), "voxels", gap)
     if mesh is None or mesh_file is None:
         remark = "voxels of 3D-R2N2 are centred on the origin whatever their header says (placement='centred')"
         gap = Gap(
-            "no mesh lies beside the voxels, so where they belong cannot be checked",
-            "Put the mesh that they were made from beside them, by the name model.obj (or .ply, .off, .stl, .glb).",
+            "there is no mesh beside the voxels, so their placement cannot be checked",
+            "Put the mesh they were made from beside them as model.obj (or .ply, .off, .stl, .glb).",
         )
-        return Findings(facts, (), None, (remark,) if _is_solid_file(path) else (), "voxels", gap)
+        return Findings(facts, (), None, (remark,) if _is_binvox_file(path) else (), "voxels", gap)
     samples = _surface_samples(mesh)
     facts += (("mesh", f"{mesh_file.name}, {len(mesh.faces):,} faces"), ("box of the mesh", _box(*mesh.bounds)))
     checks = _checks(placed, samples)
     return Findings(facts, checks, _cause(placed, samples, path, checks[0].value), kind="voxels")
 
 
-def _placed(voxels: Voxels) -> _Placed:
+def _place(voxels: Voxels) -> _PlacedVoxels:
     T = voxels.world_from_lattice
     occupied = voxels.occupancy.numpy().transpose(2, 1, 0)
     step = T[:3, :3].diagonal()
     lower = T[:3, 3] - 0.5 * step
-    return _Placed(occupied, lower, lower + step * occupied.shape)
+    return _PlacedVoxels(occupied, lower, lower + step * occupied.shape)
 
 
-def _facts(placed: _Placed) -> tuple[tuple[str, str], ...]:
+def _facts(placed: _PlacedVoxels) -> tuple[tuple[str, str], ...]:
     count, shape = int(placed.occupied.sum()), placed.occupied.shape
     facts = [
         ("voxels", f"{shape[0]} x {shape[1]} x {shape[2]} (x, y, z)"),
@@ -97,7 +96,7 @@ def _facts(placed: _Placed) -> tuple[tuple[str, str], ...]:
         index = np.argwhere(placed.occupied)
         step = (placed.upper - placed.lower) / shape
         box = _box(placed.lower + index.min(0) * step, placed.lower + (index.max(0) + 1) * step)
-        facts.append(("box of what is occupied", box))
+        facts.append(("box of the occupied voxels", box))
     return tuple(facts)
 
 
@@ -105,7 +104,7 @@ def _box(lower: np.ndarray, upper: np.ndarray) -> str:
     return ", ".join(f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in zip("xyz", lower, upper, strict=True))
 
 
-def _is_solid_file(path: Path) -> bool:
+def _is_binvox_file(path: Path) -> bool:
     try:
         return is_binvox(path)
     except OSError:
@@ -115,11 +114,11 @@ def _is_solid_file(path: Path) -> bool:
 def _find_mesh(path: Path) -> Path | None:
     try:
         folder = path if path.is_dir() else path.parent
-        solids = plain_files(path, PATTERN) if path.is_dir() else [path]
+        voxel_files = plain_files(path, PATTERN) if path.is_dir() else [path]
         meshes = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
     except OSError as error:
         raise DataError(path, f"cannot be read ({error})") from error
-    for stem in (*(file.stem for file in solids), *USUAL_STEMS):
+    for stem in (*(file.stem for file in voxel_files), *USUAL_STEMS):
         found = next((file for file in meshes if file.stem == stem), None)
         if found is not None:
             return found
@@ -127,7 +126,7 @@ def _find_mesh(path: Path) -> Path | None:
 
 
 def _surface_samples(mesh: Mesh) -> np.ndarray:
-    """(SAMPLES, 3) points, equally dense on all faces; the same for the same mesh."""
+    """(SAMPLES, 3) points, equally dense on all faces, with a fixed seed."""
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     rng = np.random.default_rng(SEED)
@@ -138,20 +137,20 @@ def _surface_samples(mesh: Mesh) -> np.ndarray:
     return a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
 
 
-def _voxels_of(placed: _Placed, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) the voxel that holds each sample, and whether there is one."""
+def _voxels_of(placed: _PlacedVoxels, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) the voxel of each sample, and whether there is one."""
     place = (samples - placed.lower) / (placed.upper - placed.lower)
     within = ((place >= -TOLERANCE) & (place <= 1 + TOLERANCE)).all(1)
     shape = np.array(placed.occupied.shape)
     return np.clip(np.floor(np.clip(place, 0, 1) * shape), 0, shape - 1).astype(int), within
 
 
-def _inside(placed: _Placed, samples: np.ndarray) -> float:
+def _inside(placed: _PlacedVoxels, samples: np.ndarray) -> float:
     index, within = _voxels_of(placed, samples)
     return float((placed.occupied[tuple(index.T)] & within).mean())
 
 
-def _checks(placed: _Placed, samples: np.ndarray) -> tuple[Check, ...]:
+def _checks(placed: _PlacedVoxels, samples: np.ndarray) -> tuple[Check, ...]:
     from scipy.ndimage import binary_dilation, binary_erosion
 
     index, within = _voxels_of(placed, samples)
@@ -168,44 +167,44 @@ def _checks(placed: _Placed, samples: np.ndarray) -> tuple[Check, ...]:
     )
 
 
-def _cause(placed: _Placed, samples: np.ndarray, path: Path, percent: float) -> Cause | None:
-    """The placement, and the order and direction of the axes, under which the surface is inside, if not as read."""
+def _cause(placed: _PlacedVoxels, samples: np.ndarray, path: Path, percent: float) -> Cause | None:
+    """The placement, and the order and direction of the axes, with which the surface is in occupied voxels."""
     if percent >= 100 * INSIDE or not placed.occupied.any():
         return None
-    # The fewest changes first, so that a symmetric solid is not said to be turned as well.
+    # The fewest changes first: symmetric objects fit several.
     for name, other in _placements(placed, path):
         for changes, words, occupied in sorted(_axis_permutations(other.occupied), key=lambda order: order[0]):
             fits = 100 * _inside(other._replace(occupied=occupied), samples)
             if fits < 100 * INSIDE or fits < percent + 100 * CLEARLY:
                 continue
             title, read = "axes of the voxels exchanged or flipped", f"Read the file with placement={name!r}"
-            remedy = f"{read} and turn the grid: {words}." if name else f"Turn the grid before use: {words}."
+            remedy = f"{read} and permute its axes: {words}." if name else f"Permute the axes of the grid: {words}."
             if changes == 0:
                 title, remedy = "voxels placed otherwise", f"{read}."
-            evidence = f"with it, the surface in occupied voxels rises from {percent:.1f} % to {fits:.1f} %"
+            evidence = f"with the correction, the surface in occupied voxels rises from {percent:.1f} % to {fits:.1f} %"
             return Cause(title, evidence, remedy)
     return None
 
 
-def _placements(placed: _Placed, path: Path) -> list[tuple[str, _Placed]]:
-    """As read, under no name, and as binvox files may also be placed."""
+def _placements(placed: _PlacedVoxels, path: Path) -> list[tuple[str, _PlacedVoxels]]:
+    """The placement that was read, without a name, and the other placements of binvox files."""
     found = [("", placed)]
-    if _is_solid_file(path):
+    if _is_binvox_file(path):
         for placement in ("header", "centred"):
-            other = _placed(read_binvox(path, placement=placement))
+            other = _place(read_binvox(path, placement=placement))
             if np.abs(other.lower - placed.lower).max() > 1e-9 * np.abs(placed.upper - placed.lower).max():
                 found.append((placement, other))
     return found
 
 
 def _axis_permutations(occupied: np.ndarray) -> list[tuple[int, str, np.ndarray]]:
-    """The grid with its axes in each order and direction: how many changes, in words, and the array."""
-    orders = []
+    """The grid with its axes in each order and direction: the number of changes, their words, and the array."""
+    found = []
     for axes in permutations(range(3)):
         for flips in product((False, True), repeat=3):
             array = occupied.transpose(axes)
             array = np.flip(array, tuple(axis for axis in range(3) if flips[axis]))
             moved = sum(axis != place for place, axis in enumerate(axes))
             words = ", ".join(f"{'xyz'[k]} is {'minus ' if flips[k] else ''}{'xyz'[axes[k]]}" for k in range(3))
-            orders.append((moved + sum(flips), words, array))
-    return orders
+            found.append((moved + sum(flips), words, array))
+    return found

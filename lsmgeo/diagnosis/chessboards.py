@@ -1,4 +1,4 @@
-"""Corners of a chessboard in its pictures, its poses, errors of its corners, and calibrations of what was seen."""
+"""Chessboards: corners in images, board poses, reprojection errors, and calibration of cameras and rigs."""
 
 from __future__ import annotations
 
@@ -14,70 +14,70 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 __all__ = [
-    "Pose", "Seen", "board_errors", "board_points", "calibrate", "calibrate_stereo", "distortion_at_corners",
-    "find_corners", "find_pairs", "look_at", "pose_of", "project", "rms", "transfer_errors",
+    "Detections", "Pose", "board_errors", "board_points", "calibrate", "calibrate_stereo", "detect_boards",
+    "distortion_at_corners", "find_corners", "find_pairs", "pose_of", "project", "rms", "transfer_errors",
 ]  # fmt: skip
 
-# Half the side of the square in which a corner is refined, in pixels: larger ones reach the neighbours of a far board.
+# Half the side of the window in which a corner is refined, px: larger ones reach the next corner of a distant board.
 WINDOW = 5
-# Fewer pictures of a board leave a camera undetermined.
+# Fewer images of a board do not determine a camera.
 FEWEST = 3
-# How much two ways to the same pose may differ: radians, and parts of the distance of the board.
+# Largest difference between two estimates of a rig: radians, and relative to the distance of the board.
 ANGLE, SHIFT = 0.02, 0.02
 
 
-class Seen(NamedTuple):
-    """What one camera saw of the board."""
+class Detections(NamedTuple):
+    """The board in the images of one camera."""
 
-    corners: tuple[np.ndarray | None, ...]  # a picture each, (N, 2) pixels, None where the board was not found
-    size: tuple[int, int]  # (height, width) of the first picture; others are not looked at
+    corners: tuple[np.ndarray | None, ...]  # of each image, (N, 2) pixels, None without a board
+    size: tuple[int, int]  # (height, width) of the first image; images of other sizes are skipped
 
     @property
     def found(self) -> list[np.ndarray]:
-        """The corners of those pictures in which the board was found."""
+        """The corners in the images that show the board."""
         return [corners for corners in self.corners if corners is not None]
 
 
 def board_points(corners: tuple[int, int]) -> np.ndarray:
-    """(N, 3) places of a board's corners in squares, row by row, z = 0."""
+    """(N, 3) corners of a board in squares, row by row, z = 0."""
     columns, rows = corners
     grid = np.mgrid[:columns, :rows].T.reshape(-1, 2)
     return np.column_stack((grid, np.zeros(len(grid))))
 
 
-def look_at(paths: Sequence[Path], corners: tuple[int, int]) -> Seen:
-    """Find the board in all pictures of one camera.
+def detect_boards(paths: Sequence[Path], corners: tuple[int, int]) -> Detections:
+    """Find the board in all images of one camera.
 
     Raises:
-        DataError: a picture is damaged.
+        DataError: an image is damaged.
     """
-    size, seen = None, []
+    size, found = None, []
     for path in paths:
-        picture = read_image(path)
-        size = size or (picture.shape[0], picture.shape[1])
-        seen.append(find_corners(picture, corners) if picture.shape[:2] == size else None)
-    return Seen(tuple(seen), size or (0, 0))
+        image = read_image(path)
+        size = size or (image.shape[0], image.shape[1])
+        found.append(find_corners(image, corners) if image.shape[:2] == size else None)
+    return Detections(tuple(found), size or (0, 0))
 
 
-def find_corners(picture: np.ndarray, corners: tuple[int, int]) -> np.ndarray | None:
-    """Find a chessboard's inner corners to a fraction of a pixel.
+def find_corners(image: np.ndarray, corners: tuple[int, int]) -> np.ndarray | None:
+    """Find a chessboard's inner corners with subpixel accuracy.
 
-    The finder may begin at either end of a board. Where the two ends differ in colour, which they do when the numbers
-    of corners along the sides are one even and one odd, the order is made the same in all pictures.
+    The detector may start at either end of a board. If one number of corners is even and the other odd, the ends
+    differ in colour, and the order is made the same in all images.
 
     Args:
-        picture: (H, W, 3) uint8.
+        image: (H, W, 3) uint8.
         corners: how many along a row and along a column.
 
     Returns:
-        (N, 2) float64 pixels, integer centres, row by row; None where the board is not there.
+        (N, 2) float64 pixels, integer centres, row by row; None without a board.
     """
     import cv2
 
-    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     try:
-        there, rough = cv2.findChessboardCorners(grey, corners)
-        if not there:
+        success, rough = cv2.findChessboardCorners(grey, corners)
+        if not success:
             return None
         rough = rough.reshape(-1, 1, 2)
         grid = rough.reshape(corners[1], corners[0], 2)
@@ -88,14 +88,14 @@ def find_corners(picture: np.ndarray, corners: tuple[int, int]) -> np.ndarray | 
     except cv2.error:
         return None
     places = np.asarray(fine, np.float64).reshape(corners[1], corners[0], 2)
-    first, last = (_grey_within(grey, places[part, part]) for part in (slice(None, 2), slice(-2, None)))
+    first, last = (_mean_grey(grey, places[part, part]) for part in (slice(None, 2), slice(-2, None)))
     if sum(corners) % 2 == 1 and first > last:
         places = places[::-1, ::-1]
     return places.reshape(-1, 2)
 
 
-def _grey_within(grey: np.ndarray, cell: np.ndarray) -> float:
-    """The mean grey in the middle of a square, given its four corners."""
+def _mean_grey(grey: np.ndarray, cell: np.ndarray) -> float:
+    """The mean grey level at the centre of a square, given its four corners."""
     x, y = np.round(cell.reshape(4, 2).mean(0)).astype(int)
     return float(grey[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].mean())
 
@@ -106,44 +106,45 @@ class Pose(NamedTuple):
     R: np.ndarray  # (3, 3)
     t: np.ndarray  # (3,)
 
-    def applied(self, points: np.ndarray) -> np.ndarray:
+    def transform(self, points: np.ndarray) -> np.ndarray:
         """Points (N, 3) in the other coordinates."""
         return np.asarray(points @ self.R.T + self.t)
 
-    def after(self, other: Pose) -> Pose:
-        """The other pose, then this one."""
+    def compose(self, other: Pose) -> Pose:
+        """The other pose, followed by this one."""
         return Pose(self.R @ other.R, self.R @ other.t + self.t)
 
     def inverse(self) -> Pose:
-        """The way back."""
+        """The inverse pose."""
         return Pose(self.R.T, -self.R.T @ self.t)
 
 
 def rms(errors: np.ndarray) -> float:
-    """The root of the mean square; NaN of nothing."""
+    """The root mean square; NaN of nothing."""
     return float(np.sqrt(np.mean(np.square(errors)))) if len(errors) else float("nan")
 
 
 def pose_of(lens: CalibratedLens, points: np.ndarray, corners: np.ndarray) -> Pose | None:
-    """Board-to-camera of one picture, None where there is none.
+    """Board-to-camera pose in one image, None without a solution.
 
     Args:
-        lens: of the camera.
-        points: (N, 3) of the board.
+        lens: the lens of the camera.
+        points: (N, 3) corners of the board.
         corners: (N, 2) pixels.
     """
     import cv2
 
-    K, bent = lens.intrinsics, np.array(lens.coefficients)
+    K, distortion = lens.intrinsics, np.array(lens.coefficients)
     try:
         if lens.kind == "fisheye":
-            corners, K, bent = cv2.fisheye.undistortPoints(corners[:, None], K, bent)[:, 0], np.eye(3), np.zeros(4)
-        found, turn, t = cv2.solvePnP(points, corners, K, bent)
+            corners = cv2.fisheye.undistortPoints(corners[:, None], K, distortion)[:, 0]
+            K, distortion = np.eye(3), np.zeros(4)
+        found, rotation, t = cv2.solvePnP(points, corners, K, distortion)
     except cv2.error:
         return None
-    if not found or not (np.isfinite(turn).all() and np.isfinite(t).all()):
+    if not found or not (np.isfinite(rotation).all() and np.isfinite(t).all()):
         return None
-    return Pose(np.asarray(cv2.Rodrigues(turn)[0]), t.ravel())
+    return Pose(np.asarray(cv2.Rodrigues(rotation)[0]), t.ravel())
 
 
 def project(lens: CalibratedLens, points: np.ndarray) -> np.ndarray:
@@ -151,40 +152,40 @@ def project(lens: CalibratedLens, points: np.ndarray) -> np.ndarray:
     import cv2
 
     camera: Any = cv2.fisheye if lens.kind == "fisheye" else cv2
-    still = np.zeros(3)
-    pixels, _ = camera.projectPoints(points[:, None], still, still, lens.intrinsics, np.array(lens.coefficients))
+    zero = np.zeros(3)
+    pixels, _ = camera.projectPoints(points[:, None], zero, zero, lens.intrinsics, np.array(lens.coefficients))
     return np.asarray(pixels).reshape(-1, 2)
 
 
-def board_errors(lens: CalibratedLens, points: np.ndarray, seen: Sequence[np.ndarray]) -> np.ndarray:
-    """Distances in pixels of all corners from where the lens sees the board at its best pose."""
-    same = Pose(np.eye(3), np.zeros(3))
-    return transfer_errors(same, points, (lens, lens), [(corners, corners) for corners in seen])
+def board_errors(lens: CalibratedLens, points: np.ndarray, found: Sequence[np.ndarray]) -> np.ndarray:
+    """Reprojection errors in pixels of all corners, with each board at its best pose."""
+    identity = Pose(np.eye(3), np.zeros(3))
+    return transfer_errors(identity, points, (lens, lens), [(corners, corners) for corners in found])
 
 
 def distortion_at_corners(lens: CalibratedLens, size: tuple[int, int]) -> float:
-    """How far, in pixels, distortion moves what a pinhole camera would see in a corner of the picture; the largest."""
+    """The largest distortion in the corners of the image, in pixels."""
     height, width = size
     corners = np.array([[x, y, 1.0] for x in (0, width - 1) for y in (0, height - 1)])
     rays = np.linalg.solve(lens.intrinsics, corners.T).T
     return float(np.linalg.norm(project(lens, rays) - corners[:, :2], axis=1).max())
 
 
-def calibrate(points: np.ndarray, seen: Seen, file: Path) -> tuple[float, CalibratedLens] | None:
-    """Calibrate one camera: its rms in pixels, and its lens with five coefficients; None where that cannot be done."""
+def calibrate(points: np.ndarray, detections: Detections, file: Path) -> tuple[float, CalibratedLens] | None:
+    """Calibrate one camera: its rms in pixels, and its lens with five coefficients; None if that fails."""
     import cv2
 
-    found = [corners.astype(np.float32)[:, None] for corners in seen.found]
+    found = [corners.astype(np.float32)[:, None] for corners in detections.found]
     if len(found) < FEWEST:
         return None
     board = [points.astype(np.float32)] * len(found)
     try:
-        error, K, bent, *_ = cv2.calibrateCamera(board, found, seen.size[::-1], np.eye(3), np.zeros(5))
+        error, K, distortion, *_ = cv2.calibrateCamera(board, found, detections.size[::-1], np.eye(3), np.zeros(5))
     except cv2.error:
         return None
-    if not (np.isfinite(error) and np.isfinite(K).all() and np.isfinite(bent).all()):
+    if not (np.isfinite(error) and np.isfinite(K).all() and np.isfinite(distortion).all()):
         return None
-    return error, CalibratedLens("perspective", K, tuple(map(float, bent.ravel())), seen.size, None, file)
+    return error, CalibratedLens("perspective", K, tuple(map(float, distortion.ravel())), detections.size, None, file)
 
 
 def calibrate_stereo(
@@ -193,13 +194,13 @@ def calibrate_stereo(
     pairs: Sequence[tuple[np.ndarray, np.ndarray]],
     size: tuple[int, int],
 ) -> tuple[float, Pose] | None:
-    """The error in pixels, and how the second camera stands to the first, their lenses held; None if it cannot be told.
+    """The rms in pixels and the pose of the second camera relative to the first, with fixed lenses; None if that fails.
 
     Args:
-        points: (N, 3) of the board.
+        points: (N, 3) corners of the board.
         lenses: of both cameras, "perspective".
-        pairs: corners in both pictures of each pair, (N, 2) pixels each.
-        size: (height, width) of the pictures.
+        pairs: corners in both images of each pair, (N, 2) pixels each.
+        size: (height, width) of the images.
     """
     import cv2
 
@@ -208,9 +209,9 @@ def calibrate_stereo(
     board = [points.astype(np.float32)] * len(pairs)
     first, second = ([pair[side].astype(np.float32)[:, None] for pair in pairs] for side in (0, 1))
     stereo_calibrate: Any = cv2.stereoCalibrate
-    held = [value for lens in lenses for value in (lens.intrinsics, np.array(lens.coefficients))]
+    fixed = [value for lens in lenses for value in (lens.intrinsics, np.array(lens.coefficients))]
     try:
-        found = stereo_calibrate(board, first, second, *held, size[::-1], flags=cv2.CALIB_FIX_INTRINSIC)
+        found = stereo_calibrate(board, first, second, *fixed, size[::-1], flags=cv2.CALIB_FIX_INTRINSIC)
     except cv2.error:
         return None
     error, *_, R, t, _, _ = found
@@ -223,19 +224,19 @@ def transfer_errors(
     lenses: tuple[CalibratedLens, CalibratedLens],
     pairs: Sequence[tuple[np.ndarray, np.ndarray]],
 ) -> np.ndarray:
-    """Distances in pixels, in the second picture, of corners from where the first picture and the rig put them.
+    """Errors in pixels of corners that the rig transfers from the first image to the second.
 
     Args:
         rig: first to second camera, in squares.
-        points: (N, 3) of the board.
+        points: (N, 3) corners of the board.
         lenses: of both cameras.
-        pairs: corners in both pictures of each pair, (N, 2) pixels each.
+        pairs: corners in both images of each pair, (N, 2) pixels each.
     """
     errors = []
     for first, second in pairs:
         pose = pose_of(lenses[0], points, first)
         if pose is not None:
-            errors.append(np.linalg.norm(project(lenses[1], rig.after(pose).applied(points)) - second, axis=1))
+            errors.append(np.linalg.norm(project(lenses[1], rig.compose(pose).transform(points)) - second, axis=1))
     return np.concatenate(errors) if errors else np.zeros(0)
 
 
@@ -245,19 +246,19 @@ def find_pairs(
     first: Sequence[np.ndarray],
     second: Sequence[np.ndarray],
 ) -> list[tuple[int, int]]:
-    """Which picture of the second camera belongs to which of the first, by the rig that most of them agree on.
+    """Pair the images of two cameras by the rig pose that most pairs agree on.
 
-    Each pair of pictures, one of either camera, says how the cameras would stand if the two were taken at once; true
-    pairs all say the same.
+    Each pair of images gives the pose of one camera relative to the other, as if taken at the same time; it is the same
+    for all correct pairs.
 
     Returns:
-        Pairs of indices, each picture once at most.
+        Pairs of indices, each image once at most.
     """
     poses = [
         [pose_of(lens, points, corners) for corners in side] for lens, side in zip(lenses, (first, second), strict=True)
     ]
     choices = [
-        (a, b, second_pose.after(first_pose.inverse()))
+        (a, b, second_pose.compose(first_pose.inverse()))
         for a, first_pose in enumerate(poses[0]) if first_pose is not None
         for b, second_pose in enumerate(poses[1]) if second_pose is not None
     ]  # fmt: skip

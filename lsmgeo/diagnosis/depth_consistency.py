@@ -1,4 +1,4 @@
-"""Depth maps under cameras: whether the surface that one view measures is where its neighbours measure it."""
+"""Depth consistency: the depth of one view is reprojected into others, or warps one image of a pair to the other."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ __all__ = [
     "warp_view",
 ]  # fmt: skip
 
-# Pixels of a view that are carried into others, and pixels that are kept of a map.
+# Pixels of a view that are reprojected into others, and pixels of a map that are kept.
 SAMPLES = 3000
 MAX_MAP = 1 << 20
-# Of the neighbours into which nearly most of a view falls, the one counts that agrees best: all around an object it
-# falls into every view whole, and is hidden in half of them.
-NEARLY_MOST = 0.7
-LEAST_SEEN = 0.02
+# The neighbours considered: those that see at least this share of what the best one sees. Among them the one with the
+# smallest error counts, because around an object a surface projects into every view but is hidden in half of them.
+LEAST_OF_BEST = 0.7
+LEAST_OVERLAP = 0.02
 
 
 class Surfaces(NamedTuple):
-    """Depth of V views, thinned to every ``step``-th row and column.
+    """Depth of V views, subsampled to every ``step``-th row and column.
 
     Attributes:
         maps: each view's (h, w) float64 depth, None for a view without.
-        steps: rows and columns between two kept ones.
-        pixels: each view's (N, 2) x, y of the pixels that are carried over.
+        steps: the distance between kept rows and columns.
+        pixels: each view's (N, 2) x, y of the pixels that are reprojected.
         depths: their depth.
     """
 
@@ -42,12 +42,12 @@ class Surfaces(NamedTuple):
 
     @property
     def views(self) -> list[int]:
-        """The views of which pixels are carried over."""
+        """The views whose pixels are reprojected."""
         return [view for view, values in enumerate(self.depths) if len(values)]
 
     @property
     def targets(self) -> list[int]:
-        """The views into which they may fall."""
+        """The views into which they are reprojected."""
         return [view for view, values in enumerate(self.maps) if values is not None]
 
 
@@ -75,7 +75,7 @@ def load_surfaces(scene: PosedImages, views: np.ndarray) -> Surfaces:
 
 
 def thinned(surfaces: Surfaces, most: int, most_views: int) -> Surfaces:
-    """The same with at most so many pixels of so many views carried over, evenly chosen, into all the views."""
+    """The same with fewer reprojected pixels: at most ``most`` of each of ``most_views`` views, evenly chosen."""
     kept = {surfaces.views[index] for index in evenly(len(surfaces.views), most_views)}
     rows = [evenly(len(depth), most if view in kept else 0) for view, depth in enumerate(surfaces.depths)]
     pixels, depths = (
@@ -86,8 +86,8 @@ def thinned(surfaces: Surfaces, most: int, most_views: int) -> Surfaces:
 
 
 def surface_points(surfaces: Surfaces, hypothesis: Hypothesis, view: int) -> np.ndarray:
-    """Where in the world a view's chosen pixels lie, (N, 3)."""
-    K, R, t = (value[view] for value in hypothesis.beside)
+    """World points of a view's chosen pixels, (N, 3)."""
+    K, R, t = (value[view] for value in hypothesis.depth_cameras)
     pixels = surfaces.pixels[view]
     rays = homogeneous(pixels) @ np.linalg.inv(K).T
     z = surfaces.depths[view] * hypothesis.depth_scale
@@ -99,28 +99,26 @@ def surface_points(surfaces: Surfaces, hypothesis: Hypothesis, view: int) -> np.
 def _compare_depth(
     surfaces: Surfaces, hypothesis: Hypothesis, points: np.ndarray, view: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depth (N,) of points in a view and what its map says there, NaN where it says nothing."""
-    maps, step = surfaces.maps[view], surfaces.steps[view]
-    assert maps is not None
-    pixels, depth = project(hypothesis.beside, view, points)
+    """Depth (N,) of points in a view and the measured depth there, NaN without one."""
+    measured, step = surfaces.maps[view], surfaces.steps[view]
+    assert measured is not None
+    pixels, depth = project(hypothesis.depth_cameras, view, points)
     if hypothesis.along_ray:
-        camera = points @ hypothesis.beside.R[view].T + hypothesis.beside.t[view]
+        camera = points @ hypothesis.depth_cameras.R[view].T + hypothesis.depth_cameras.t[view]
         depth = np.sign(depth) * np.linalg.norm(camera, axis=1)
     with np.errstate(invalid="ignore"):
         places = np.round(pixels / step)
-        height, width = maps.shape
+        height, width = measured.shape
         inside = (places >= 0).all(1) & (places[:, 0] < width) & (places[:, 1] < height) & (depth > 0)
     columns, rows = np.where(inside[:, None], places, 0).astype(int).T
-    there = maps[rows, columns] * hypothesis.depth_scale
+    there = measured[rows, columns] * hypothesis.depth_scale
     return depth, np.where(inside & (there > 0), there, np.nan)
 
 
 def relative_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> np.ndarray:
-    """Signed relative differences of depth, carried over against measured there, (M,).
+    """Signed relative differences between reprojected and measured depth, (M,), see `best_neighbour_errors`.
 
-    Of each view, the neighbours are asked into which nearly most of its pixels fall under this very hypothesis (cameras
-    that are wrong may place views anywhere), and of them the one counts that agrees best. Pixels that another surface
-    hides give large differences; the median bears them.
+    Occluded pixels give large differences; the median tolerates them.
     """
     return np.concatenate(
         [np.zeros(0), *(errors for _, _, errors in best_neighbour_errors(surfaces, hypothesis).values())]
@@ -128,7 +126,10 @@ def relative_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> np.ndarray:
 
 
 def best_neighbour_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> dict[int, tuple[int, np.ndarray, np.ndarray]]:
-    """For each view that falls into others: the one that counts, which pixels it knows (N,) bool, and the errors."""
+    """For each view the best neighbour, which pixels have depth there (N,) bool, and their relative errors.
+
+    Neighbours are chosen for each hypothesis anew: wrong cameras may place views anywhere.
+    """
     best = {}
     for view in surfaces.views:
         points = surface_points(surfaces, hypothesis, view)
@@ -137,43 +138,43 @@ def best_neighbour_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> dict[in
             if other != view:
                 depth, there = _compare_depth(surfaces, hypothesis, points, other)
                 known = np.isfinite(there)
-                if known.mean() >= LEAST_SEEN:
+                if known.mean() >= LEAST_OVERLAP:
                     found.append((other, known, (depth[known] - there[known]) / there[known]))
         if found:
             most = max(len(errors) for _, _, errors in found)
-            near = [row for row in found if len(row[2]) >= NEARLY_MOST * most]
+            near = [row for row in found if len(row[2]) >= LEAST_OF_BEST * most]
             best[view] = min(near, key=lambda row: float(np.median(np.abs(row[2]))))
     return best
 
 
 def warp_errors(
-    surfaces: Surfaces, hypothesis: Hypothesis, pictures: tuple[np.ndarray, ...]
+    surfaces: Surfaces, hypothesis: Hypothesis, images: tuple[np.ndarray, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Differences in grey levels between each of two pictures and the other one fetched by depth, and fetched unmoved.
+    """Differences in grey levels between each of two images and the other one, warped by depth and not warped.
 
     Args:
         surfaces: of two views.
         hypothesis: their cameras.
-        pictures: (H, W) grey, at the photographs' sizes.
+        images: (H, W) grey, at the original sizes.
 
     Returns:
-        (M,) and (M,) absolute differences at the pixels that fall into the other picture.
+        (M,) and (M,) absolute differences at the pixels that project into the other image.
     """
-    each = [warp_view(surfaces, hypothesis, pictures, view)[1:] for view in surfaces.views]
+    each = [warp_view(surfaces, hypothesis, images, view)[1:] for view in surfaces.views]
     moved, unmoved = (np.concatenate([np.zeros(0), *parts]) for parts in zip(*each, strict=True))
     return moved, unmoved
 
 
 def warp_view(
-    surfaces: Surfaces, hypothesis: Hypothesis, pictures: tuple[np.ndarray, ...], view: int
+    surfaces: Surfaces, hypothesis: Hypothesis, images: tuple[np.ndarray, ...], view: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For one of two views the pixels (M, 2) that fall into the other picture, and the differences as `warp_errors`."""
+    """Of one of two views the pixels (M, 2) that project into the other image, and differences as in `warp_errors`."""
     import cv2
 
     other = 1 - view
     points = surface_points(surfaces, hypothesis, view)
-    pixels, depth = project(hypothesis.photographs, other, points)
-    height, width = pictures[other].shape
+    pixels, depth = project(hypothesis.cameras, other, points)
+    height, width = images[other].shape
     own = surfaces.pixels[view]
     with np.errstate(invalid="ignore"):
         inside = (pixels >= 0).all(1) & (pixels <= [width - 1, height - 1]).all(1) & (depth > 0)
@@ -181,10 +182,10 @@ def warp_view(
     if not inside.any():
         return np.zeros((0, 2)), np.zeros(0), np.zeros(0)
     own = own[inside]
-    here = pictures[view][own[:, 1].astype(int), own[:, 0].astype(int)].astype(np.float64)
+    here = images[view][own[:, 1].astype(int), own[:, 0].astype(int)].astype(np.float64)
     differences = []
     for places in (pixels[inside], own):
         maps = places.astype(np.float32)[:, None]
-        there = cv2.remap(pictures[other].astype(np.float32), maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
+        there = cv2.remap(images[other].astype(np.float32), maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
         differences.append(np.abs(there[:, 0] - here))
     return own, differences[0], differences[1]

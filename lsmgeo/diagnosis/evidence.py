@@ -1,4 +1,4 @@
-"""The kinds of evidence about posed photographs: what is measured once, and what follows of it under given cameras."""
+"""The kinds of evidence about posed images: each is gathered once, and measured again for every hypothesis."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from lsmgeo.diagnosis.silhouette_consistency import (
     load_masks,
     near_cells,
     occupied_cells,
-    outline,
-    overlap,
+    silhouette_hull,
+    silhouette_overlap,
     within_a_cell,
 )
 from lsmgeo.diagnosis.two_view_geometry import evenly
@@ -42,7 +42,7 @@ LEAST_WITH_PARALLAX = 30
 LEAST_OBSERVATIONS = 20
 LEAST_SILHOUETTE_PAIRS = 3
 LEAST_PAIRS = 3
-# Matches of a pair, and pairs of outlines, that a hypothesis is tried on.
+# Subsets on which hypotheses are compared: matches of a pair, pairs of silhouettes, pixels and views.
 MATCHES_TRIED = 100
 SILHOUETTE_PAIRS, SILHOUETTE_PAIRS_TRIED = 300, 60
 PIXELS_TRIED, VIEWS_TRIED = 400, 12
@@ -52,10 +52,10 @@ class Evidence:
     """Something that can be measured again with other cameras.
 
     Attributes:
-        slow: whether a measurement takes long enough to be spared for hypotheses that are otherwise likely.
+        slow: whether it is measured only for hypotheses that are likely by other evidence.
         measurable: whether there is enough to measure.
-        everything: what is measured to be reported; None where that is all alike.
-        tried: as much of it as it takes to compare hypotheses.
+        everything: the data of the reported checks; None without a subset.
+        tried: the subset on which hypotheses are compared.
     """
 
     slow = False
@@ -64,11 +64,11 @@ class Evidence:
     tried: Any = None
 
     def measure(self, hypothesis: Hypothesis) -> list[Check]:
-        """The checks under a hypothesis, always the same ones, on as much as it takes to compare hypotheses."""
+        """The checks of a hypothesis on the subset; always the same checks."""
         return self._measured(hypothesis, self.tried)
 
     def measure_all(self, hypothesis: Hypothesis) -> list[Check]:
-        """The checks on all that there is, to be reported."""
+        """The checks of a hypothesis on everything, to be reported."""
         return self._measured(hypothesis, self.everything)
 
     def _measured(self, hypothesis: Hypothesis, data: Any) -> list[Check]:
@@ -76,29 +76,29 @@ class Evidence:
 
 
 class Features(Evidence):
-    """Matched features: their distance from epipolar lines, and on which side of the cameras they meet."""
+    """Matched features: their distance from epipolar lines, and cheirality."""
 
     def __init__(self, scene: PosedImages, views: np.ndarray, sizes: np.ndarray, cameras: Geometry) -> None:
         self.matches = self.everything = match_features(scene, views)
         self.limit = pixel_limit(sizes)
         self.tried = self.matches.thinned(MATCHES_TRIED)
-        # Whether sides are judged is decided once, so that hypotheses are compared on the same checks.
+        # Decided once, so that hypotheses are compared on the same checks.
         known = np.isfinite(in_front(self.matches, cameras)).sum()
-        self.judges_sides = bool(known >= LEAST_WITH_PARALLAX)
+        self.judges_cheirality = bool(known >= LEAST_WITH_PARALLAX)
         self.measurable = len(self.matches.pair) > 0
 
     def _measured(self, hypothesis: Hypothesis, matches: Matches) -> list[Check]:
-        distances = np.abs(sampson_distances(matches, hypothesis.photographs))
+        distances = np.abs(sampson_distances(matches, hypothesis.cameras))
         name = "epipolar error of matched features"
         checks = [Check(name, float(np.median(distances)), "px", self.limit, len(distances), "matches")]
         if len(matches.first) >= LEAST_PAIRS:
-            # The median bears a few photographs at wrong cameras; this does not.
+            # The median tolerates a few images with wrong cameras; this check does not.
             agree = np.mean(pair_medians(distances, matches) <= LIMITS["view"] * self.limit)
-            checks.append(share("pairs of photographs that agree", agree, "pairs", len(matches.first), "pairs"))
-        if self.judges_sides:
-            front = in_front(matches, hypothesis.photographs)
+            checks.append(share("pairs of images that agree", agree, "pairs", len(matches.first), "pairs"))
+        if self.judges_cheirality:
+            front = in_front(matches, hypothesis.cameras)
             front = front[np.isfinite(front)]
-            # Cameras in one place have no parallax, and nothing speaks against them.
+            # Without a baseline there is no parallax, and nothing to contradict the cameras.
             checks.append(share(SIDES, front.mean() if len(front) else 1.0, "in front", len(front), "matches"))
         return checks
 
@@ -117,11 +117,11 @@ class Points(Evidence):
         assert scene.points is not None
         self.points = scene.points
         self.limit = pixel_limit(sizes)
-        self.measurable = sum(len(seen.points) for seen in self.points.observations) >= LEAST_OBSERVATIONS
+        self.measurable = sum(len(view.points) for view in self.points.observations) >= LEAST_OBSERVATIONS
 
     def _measured(self, hypothesis: Hypothesis, _: Any) -> list[Check]:
         """Median reprojection error, and the share of observations with their point in front of the camera."""
-        errors, depths, _ = reprojection_errors(self.points, hypothesis.beside)
+        errors, depths, _ = reprojection_errors(self.points, hypothesis.depth_cameras)
         count, of, error = len(errors), "observations", float(np.median(errors))
         return [
             Check("reprojection error of sparse points", error, "px", self.limit, count, of),
@@ -146,31 +146,31 @@ class DepthMaps(Evidence):
 
 
 class StereoPair(Evidence):
-    """A rectified pair with depth: one picture fetched by depth is the other one."""
+    """A rectified pair with depth: one image warped by depth equals the other one."""
 
     def __init__(self, scene: PosedImages) -> None:
         self.surfaces = load_surfaces(scene, np.arange(2))
-        self.pictures = tuple(grey_image(scene, view, max(scene.size(view)))[0] for view in range(2))
+        self.images = tuple(grey_image(scene, view, max(scene.size(view)))[0] for view in range(2))
         self.measurable = len(self.surfaces.views) > 0
 
     def _measured(self, hypothesis: Hypothesis, _: Any) -> list[Check]:
         """Median difference in grey levels, against that without a warp."""
-        moved, unmoved = warp_errors(self.surfaces, hypothesis, self.pictures)
+        moved, unmoved = warp_errors(self.surfaces, hypothesis, self.images)
         if len(moved) == 0:
-            return [Check("picture warped by depth", float("inf"), "grey levels", 1.0, 0, "pixels")]
+            return [Check("image warped by depth", float("inf"), "grey levels", 1.0, 0, "pixels")]
         limit = LIMITS["warp"] * float(np.median(unmoved))
         value = float(np.median(moved))
-        return [Check("picture warped by depth", value, "grey levels", max(limit, 1.0), len(moved), "pixels")]
+        return [Check("image warped by depth", value, "grey levels", max(limit, 1.0), len(moved), "pixels")]
 
 
 class Silhouettes(Evidence):
-    """Silhouettes of cut-out photographs: planes through the baseline touch them in both views."""
+    """Silhouettes of cut-out images: epipolar tangents touch them in both views."""
 
     def __init__(self, scene: PosedImages, views: np.ndarray, sizes: np.ndarray) -> None:
         masks = ((view, scene.load_mask(view)) for view in views.tolist())
-        contours = ((view, None if mask is None else outline(mask.numpy())) for view, mask in masks)
-        self.outlines = {view: contour for view, contour in contours if contour is not None}
-        pairs = list(itertools.combinations(sorted(self.outlines), 2))
+        contours = ((view, None if mask is None else silhouette_hull(mask.numpy())) for view, mask in masks)
+        self.contours = {view: contour for view, contour in contours if contour is not None}
+        pairs = list(itertools.combinations(sorted(self.contours), 2))
         self.pairs = self.everything = [pairs[index] for index in evenly(len(pairs), SILHOUETTE_PAIRS)]
         self.tried = [self.pairs[index] for index in evenly(len(self.pairs), SILHOUETTE_PAIRS_TRIED)]
         self.limit = pixel_limit(sizes)
@@ -178,71 +178,71 @@ class Silhouettes(Evidence):
         self.measurable = len(self.pairs) >= LEAST_SILHOUETTE_PAIRS
 
     def _measured(self, hypothesis: Hypothesis, pairs: list[tuple[int, int]]) -> list[Check]:
-        distances = self.distances(hypothesis.photographs, pairs)
+        distances = self.distances(hypothesis.cameras, pairs)
         known = distances[np.isfinite(distances)]
         value = float(np.median(known)) if len(known) else float("inf")
-        return [Check("epipolar tangency of the outlines", value, "px", self.limit, len(known), "tangents")]
+        return [Check("epipolar tangency of the silhouettes", value, "px", self.limit, len(known), "tangents")]
 
     def distances(self, cameras: Geometry, pairs: list[tuple[int, int]]) -> np.ndarray:
-        """(P, 2) px for each pair of views, NaN where a pair tells nothing."""
+        """(P, 2) px for each pair of views, NaN where there is no distance."""
         return np.array([self.distance(cameras, first, second, first, second) for first, second in pairs])
 
     def distance(self, cameras: Geometry, first: int, second: int, camera1: int, camera2: int) -> np.ndarray:
-        """(2,) px for two views' outlines seen by two cameras."""
-        both = cameras.taken(np.array([camera1, camera2]))
-        return epipolar_tangency(self.outlines[first], self.outlines[second], both)
+        """(2,) px for the silhouettes of two views in two cameras."""
+        both = cameras.select(np.array([camera1, camera2]))
+        return epipolar_tangency(self.contours[first], self.contours[second], both)
 
 
 class VoxelModel(Evidence):
-    """The solid that photographs show: it projects into the outlines, and depth lies on it."""
+    """The voxels of the object: they project into the silhouettes, and depth points lie on them."""
 
     slow = True
 
     def __init__(self, scene: PosedImages, views: np.ndarray) -> None:
         assert scene.voxels is not None
-        self.near, self.lattice = near_cells(scene.voxels)
-        self.solid = occupied_cells(scene.voxels)
-        self.silhouettes = load_masks(scene, views) if scene.cut_out else None
+        self.near, self.world_from_lattice = near_cells(scene.voxels)
+        self.cells = occupied_cells(scene.voxels)
+        self.masks = load_masks(scene, views) if scene.cut_out else None
         surfaces = load_surfaces(scene, views) if scene.depths is not None else None
         self.surfaces = surfaces if surfaces is not None and surfaces.views else None
-        self.measurable = len(self.solid.centers) > 0 and (self.silhouettes or self.surfaces) is not None
+        self.measurable = len(self.cells.centers) > 0 and (self.masks or self.surfaces) is not None
 
     def _measured(self, hypothesis: Hypothesis, _: Any) -> list[Check]:
-        """Cells inside the outlines, overlap with them, and depth points near occupied cells."""
+        """Cells inside the silhouettes, overlap with them, and depth points near occupied cells."""
         checks = []
-        if self.silhouettes is not None:
-            recalls, unions = overlap(self.silhouettes, self.solid, hypothesis.photographs)
-            cells = len(self.solid.centers) * len(recalls)
-            checks.append(share("voxels inside the outlines", recalls.mean(), "inside", cells, "voxels"))
-            name = "overlap of the voxels with the outlines"
+        if self.masks is not None:
+            recalls, unions = silhouette_overlap(self.masks, self.cells, hypothesis.cameras)
+            cells = len(self.cells.centers) * len(recalls)
+            checks.append(share("voxels inside the silhouettes", recalls.mean(), "inside", cells, "voxels"))
+            name = "overlap of voxels and silhouettes"
             checks.append(share(name, unions.mean(), "overlap", len(unions), "views"))
         if self.surfaces is not None:
             points = np.concatenate([surface_points(self.surfaces, hypothesis, view) for view in self.surfaces.views])
-            near = within_a_cell(points, self.near, self.lattice)
+            near = within_a_cell(points, self.near, self.world_from_lattice)
             checks.append(share("depth points within a cell of the voxels", near, "near a cell", len(points), "points"))
         return checks
 
 
 class PrincipalPoints(Evidence):
-    """Principal points: near the middle of the picture where nothing else tells whether K belongs to its size."""
+    """Principal points: near the image centre, where nothing else reveals a K of another resolution."""
 
     def __init__(self, sizes: np.ndarray) -> None:
         self.sizes = sizes
 
     def _measured(self, hypothesis: Hypothesis, _: Any) -> list[Check]:
-        """Largest distance of a principal point from the middle."""
-        value = 100 * float(principal_offsets(hypothesis.photographs, self.sizes).max())
-        return [Check(CENTRED, value, "%", LIMITS["centred"], len(self.sizes), "photographs")]
+        """Largest distance of a principal point from the image centre."""
+        value = 100 * float(principal_offsets(hypothesis.cameras, self.sizes).max())
+        return [Check(CENTRED, value, "%", LIMITS["centred"], len(self.sizes), "images")]
 
 
 def principal_offsets(cameras: Geometry, sizes: np.ndarray) -> np.ndarray:
-    """Distance of the principal points from the middle, (V, 2), as a fraction of width and height."""
-    middle = (sizes[:, ::-1] - 1) / 2
-    return np.asarray(np.abs(cameras.K[:, :2, 2] - middle) / sizes[:, ::-1])
+    """Distance of the principal points from the image centre, (V, 2), as a fraction of width and height."""
+    center = (sizes[:, ::-1] - 1) / 2
+    return np.asarray(np.abs(cameras.K[:, :2, 2] - center) / sizes[:, ::-1])
 
 
 def is_rectified(cameras: Geometry) -> bool:
-    """Whether these are two cameras side by side that look the same way."""
+    """Whether these are two cameras side by side with the same orientation."""
     if len(cameras.K) != 2:
         return False
     across = cameras.t[1] - cameras.t[0]
@@ -254,25 +254,25 @@ def is_rectified(cameras: Geometry) -> bool:
 
 
 def gather_evidence(scene: PosedImages, views: np.ndarray, sizes: np.ndarray, stated: Hypothesis) -> list[Evidence]:
-    """All that can be measured about a scene.
+    """Everything that can be measured about a scene.
 
     Raises:
-        DataError: a photograph, a mask or a depth map that is needed is missing or damaged.
+        DataError: an image, a mask or a depth map that is needed is missing or damaged.
     """
     candidates: list[Evidence] = []
     if len(scene) >= 2:
-        candidates.append(Features(scene, views, sizes, stated.photographs))
+        candidates.append(Features(scene, views, sizes, stated.cameras))
     if scene.points is not None:
         candidates.append(Points(scene, sizes))
     if scene.cut_out and len(scene) >= 2:
         candidates.append(Silhouettes(scene, views, sizes))
     if scene.depths is not None:
-        if is_rectified(stated.photographs):
+        if is_rectified(stated.cameras):
             candidates.append(StereoPair(scene))
         else:
             candidates.append(DepthMaps(scene, views))
     if scene.voxels is not None:
         candidates.append(VoxelModel(scene, views))
     found = [evidence for evidence in candidates if evidence.measurable]
-    # A rectified pair's rows stay its rows whatever K is.
-    return [*found, PrincipalPoints(sizes)] if found and is_rectified(stated.photographs) else found
+    # The rows of a rectified pair correspond whatever K is, so nothing else depends on K.
+    return [*found, PrincipalPoints(sizes)] if found and is_rectified(stated.cameras) else found

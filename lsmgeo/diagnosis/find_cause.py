@@ -1,4 +1,4 @@
-"""Which mistake explains what was measured: every one is undone in turn, and all is measured again."""
+"""The most likely cause of large errors: each candidate correction is applied and everything is measured again."""
 
 from __future__ import annotations
 
@@ -28,14 +28,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Explanation", "explain", "invisible_errors", "is_decisive", "is_suspicious", "score"]
 
-# By what factor an error must fall that stays beyond its limit; and how good is as good as the best.
+# Factor by which an error that stays above its limit must fall; score differences that count as equal.
 DECISIVE, TIE, RIVAL = 4.0, 0.05, 0.35
-# A check that passed may not come nearer to its limit than this.
+# Multiples of the limit: a check passes up to the first, and is looked into from the second.
 PASSED = 1.0
-# A check this near to its limit is looked into though it passes.
 SUSPICIOUS = 0.5
 FINALISTS = 16
-# Of mistakes that explain the same, the one that is made more often is named.
+# Of errors that explain the measurements equally well, the more common one is reported.
 COMMON = (
     "poses inverted",
     "OpenGL axes",
@@ -53,13 +52,13 @@ NICE = (0.001, 0.01, 0.1, 0.125, 0.2, 0.25, 1 / 3, 0.5, 2 / 3, 0.75, 1.5, 2.0, 3
 
 
 class Explanation(NamedTuple):
-    """A mistake whose correction mends what was measured.
+    """An error whose correction makes the checks pass.
 
     Attributes:
-        candidate: the mistake and the corrected geometry.
-        before: the checks as the cameras are.
-        after: the same checks with the mistake undone.
-        rivals: the names of other mistakes that would explain the same.
+        candidate: the error and the corrected geometry.
+        before: the checks for the stated cameras.
+        after: the same checks for the corrected cameras.
+        rivals: the names of other errors that explain the measurements as well.
     """
 
     candidate: Candidate
@@ -69,27 +68,27 @@ class Explanation(NamedTuple):
 
 
 def score(checks: Sequence[Check]) -> float:
-    """How bad checks are together: the mean of the logarithms of their multiples of the limit."""
+    """How bad checks are together: the mean logarithm of their multiples of the limit."""
     return float(np.mean(np.log([badness(check) for check in checks])))
 
 
 def is_suspicious(checks: Sequence[Check]) -> bool:
-    """Whether a check failed, or is so near to its limit that it is looked into."""
+    """Whether a check failed or is close to its limit."""
     return any(badness(check) > _suspicious_from(check) for check in checks)
 
 
 def _suspicious_from(check: Check) -> float:
-    # One of few pairs may be bad by itself, and mistakes that concern all cameras put more matches behind them.
+    # A single bad pair is no sign of an error in all cameras, which would put more matches behind them.
     at_most_one = check.at_least and (100 - check.value) * check.measured <= 100 * (1 + 1e-9)
     return PASSED if check.name in (CENTRED, SIDES) or at_most_one else SUSPICIOUS
 
 
 def is_decisive(before: Sequence[Check], after: Sequence[Check]) -> bool:
-    """Whether a correction mends what failed, or where nothing did, brings an error down much; and spoils nothing."""
+    """Whether a correction fixes what failed, or else reduces an error by far, and makes nothing worse."""
     rows = [(badness(old), badness(new), _suspicious_from(old)) for old, new in zip(before, after, strict=True)]
-    mended = all(new <= PASSED or (old > PASSED and new <= old / DECISIVE) for old, new, _ in rows)
+    fixed = all(new <= PASSED or (old > PASSED and new <= old / DECISIVE) for old, new, _ in rows)
     better = any(new <= max(old, PASSED) / DECISIVE or (old > PASSED >= new) for old, new, least in rows if old > least)
-    return mended and better
+    return fixed and better
 
 
 def explain(
@@ -99,23 +98,23 @@ def explain(
     sizes: np.ndarray,
     views: np.ndarray,
 ) -> tuple[Explanation | None, tuple[str, ...]]:
-    """Find the mistake whose correction brings the errors down decisively.
+    """Find the error whose correction makes the measured errors decisively smaller.
 
     Args:
-        stated: the cameras as they are.
+        stated: the cameras that the scene states.
         evidence: what can be measured again.
-        names: the photographs' names.
+        names: the images' names.
         sizes: (V, 2) their height and width.
-        views: the views that were looked at.
+        views: the views that are measured.
 
     Returns:
-        The explanation, None where there is none; and the names of all mistakes that were tried.
+        The explanation, None without one; and the names of all errors that were tried.
     """
     quick = [item for item in evidence if not item.slow] or list(evidence)
     before = _measured(evidence, stated)
     with_depth = [item for item in evidence if getattr(item, "surfaces", None) is not None]
     others = [item for item in evidence if item not in with_depth]
-    # What fails without any depth is not explained by it.
+    # Wrong depth does not explain failures of the rest.
     if not all(check.passed for check in _measured(others, stated)):
         with_depth = []
     candidates = [*camera_candidates(stated, sizes), *resolution_candidates(stated, sizes)]
@@ -127,7 +126,7 @@ def explain(
     candidates.sort(key=lambda candidate: COMMON.index(candidate.name) if candidate.name in COMMON else len(COMMON))
     scores = [score(_measured(quick, candidate.hypothesis)) for candidate in candidates]
     finalists = np.argsort(scores, kind="stable")[:FINALISTS].tolist()
-    # What concerns depth alone looks the same to quick evidence.
+    # Quick evidence cannot distinguish errors of the depth.
     finalists += [rank for rank, candidate in enumerate(candidates) if candidate.name.startswith("depth")]
     decisive = []
     for rank in dict.fromkeys(finalists):
@@ -138,29 +137,29 @@ def explain(
         return None, tried
     lowest = min(value for value, _, _ in decisive)
     name = min((row for row in decisive if row[0] <= lowest + TIE), key=lambda row: row[1])[2].name
-    # Of corrections of one kind the plainest that does nearly as well: twice, rather than 1.998 times.
+    # Among corrections of one kind, the simplest of nearly equal ones: 2, rather than 1.998.
     same = [row for row in decisive if row[2].name == name]
     value, _, best = min((row for row in same if row[0] <= lowest + RIVAL), key=lambda row: row[1])
     close = dict.fromkeys(row[2].name for row in decisive if row[0] <= value + RIVAL)
-    # What holds the same mistake and one more besides is no rival.
+    # The same error combined with another one is no rival.
     rivals = [name for name in close if not name.startswith(best.name)]
-    told = [
+    checks = [
         tuple(check for item in evidence for check in item.measure_all(hypothesis))
         for hypothesis in (stated, best.hypothesis)
     ]
-    return Explanation(best, told[0], told[1], tuple(rivals)), tried
+    return Explanation(best, checks[0], checks[1], tuple(rivals)), tried
 
 
 def invisible_errors(stated: Hypothesis, evidence: Sequence[Evidence], sizes: np.ndarray) -> tuple[str, ...]:
-    """Names of common mistakes that would have passed all checks: cameras that are right do not show that they are.
+    """Names of common errors that would pass all checks of this scene.
 
     Args:
-        stated: the cameras as they are, which pass.
+        stated: the cameras that the scene states, which pass.
         evidence: what can be measured again.
-        sizes: (V, 2) height and width of the photographs.
+        sizes: (V, 2) height and width of the images.
     """
-    planted = [*camera_candidates(stated, sizes), scaled(stated, np.full(2, 0.5))]
-    usual = {candidate.name: candidate.hypothesis for candidate in reversed(planted) if candidate.name in COMMON[:4]}
+    candidates = [*camera_candidates(stated, sizes), scaled(stated, np.full(2, 0.5))]
+    usual = {candidate.name: candidate.hypothesis for candidate in reversed(candidates) if candidate.name in COMMON[:4]}
     return tuple(name for name in COMMON[:4] if not is_suspicious(_measured(evidence, usual[name])))
 
 
@@ -169,7 +168,7 @@ def _measured(evidence: Sequence[Evidence], hypothesis: Hypothesis) -> list[Chec
 
 
 def _scales(stated: Hypothesis, quick: Sequence[Evidence], with_depth: Sequence[Evidence]) -> list[Candidate]:
-    """Scales of K, of focal lengths and of depth that serve best."""
+    """The best scales of K, of focal lengths and of depth."""
     found = _refined(SCALES, quick, lambda scale: scaled(stated, np.full(2, scale)))
     found += _refined(SCALES, quick, partial(focal_scaled, stated))
     if with_depth:
@@ -178,7 +177,7 @@ def _scales(stated: Hypothesis, quick: Sequence[Evidence], with_depth: Sequence[
 
 
 def _refined(scales: np.ndarray, evidence: Sequence[Evidence], make: Callable[[float], Candidate]) -> list[Candidate]:
-    """The best scale of a grid and between its neighbours, after the round number near it."""
+    """The best scale, searched on a grid and refined; a round number near it comes first."""
     from scipy.optimize import minimize_scalar
 
     def cost(logarithm: float) -> float:

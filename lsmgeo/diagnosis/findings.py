@@ -1,4 +1,4 @@
-"""What an examination finds: facts, measurements, how far each may go, the likely mistake; and all that in words."""
+"""Results of an examination: facts, checks with their limits, the likely cause; and the report as text."""
 
 from __future__ import annotations
 
@@ -11,44 +11,44 @@ __all__ = [
     "pixel_limit", "report", "share",
 ]  # fmt: skip
 
-# Good sets stay at a quarter of these or below; the mistakes that people make go beyond by ten times and more.
+# Good data stay below a quarter of these; common errors exceed them tenfold and more.
 LIMITS = {
-    "pixels": 0.001,  # of the picture's diagonal: 1 px where that is 1000 px; never below the next
-    "fewest pixels": 0.75,  # features and outlines are not located better in small pictures
-    "views": 100.0,  # % of the photographs that agree with the others
-    "pairs": 90.0,  # % of the pairs of photographs within three times the limit of pixels
+    "pixels": 0.001,  # of the image diagonal: 1 px where that is 1000 px; never below the next
+    "fewest pixels": 0.75,  # features and silhouettes are located no better in small images
+    "views": 100.0,  # % of the images that agree with the others
+    "pairs": 90.0,  # % of the pairs of images within three times the limit of pixels
     "in front": 90.0,  # % of the matched features with enough parallax
     "depth": 2.0,  # %, median relative difference of depth
-    "warp": 0.5,  # of the difference in grey levels with no warp
-    "inside": 97.0,  # % of the cells that reach into the outlines
-    "overlap": 60.0,  # %, intersection over union of solid and outline
+    "warp": 0.5,  # of the difference in grey levels without a warp
+    "inside": 97.0,  # % of the cells that overlap the silhouettes
+    "overlap": 60.0,  # %, intersection over union of voxels and silhouette
     "near a cell": 95.0,  # % of depth points at most one cell away from an occupied one
-    "centred": 20.0,  # % of the width or height between principal point and middle, where nothing else tells of K
-    "view": 3.0,  # times the limit of pixels, by which one view stands out
+    "centred": 20.0,  # % of the width or height between principal point and image centre, of a rectified pair
+    "view": 3.0,  # multiple of the pixel limit at which a single view is an outlier
 }
 
 LEAST_BADNESS, MOST_BADNESS = 0.02, 1e6
-# A principal point in the very middle is no better than one that lies well.
-CENTRED = "principal point off the middle"
+# A principal point within its limit is as good as one at the image centre.
+CENTRED = "principal point off the image centre"
 SIDES = "matched features in front of both cameras"
 VERDICTS = {
-    "photographs": ("cameras and what they saw belong together", "cameras and what they saw do not belong together"),
-    "calibration": ("lenses and pictures of the board agree", "lenses and pictures of the board do not agree"),
+    "images": ("the cameras fit the data", "the cameras do not fit the data"),
+    "calibration": ("the lenses fit the images of the board", "the lenses do not fit the images of the board"),
     "voxels": ("the mesh and its voxels agree", "the mesh and its voxels do not agree"),
 }
-BEYOND = 1e8
+LARGEST = 1e8  # printed as infinite
 
 
 class Check(NamedTuple):
-    """One measurement, and how far it may go.
+    """One measurement and its limit.
 
     Attributes:
         name: what was measured, such as "epipolar error of matched features".
         value: the median, or the fraction.
         unit: "px", "%", "grey levels" or "".
-        limit: what the value must not exceed, or with ``at_least`` not fall below.
-        measured: number of single measurements behind the value.
-        of: what these are, such as "matches".
+        limit: the largest value that passes, or with ``at_least`` the smallest.
+        measured: the number of single measurements.
+        of: their name, such as "matches".
         at_least: whether large values are good.
     """
 
@@ -62,21 +62,21 @@ class Check(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Whether the value keeps its limit; NaN does not."""
+        """Whether the value is within its limit; NaN is not."""
         return self.value >= self.limit if self.at_least else self.value <= self.limit
 
 
 def share(name: str, fraction: float | np.floating, limit: str, measured: int, of: str) -> Check:
-    """The check that a fraction, told in %, does not fall below one of the `LIMITS`."""
+    """The check that a fraction, in %, is at least one of the `LIMITS`."""
     return Check(name, 100 * float(fraction), "%", LIMITS[limit], measured, of, at_least=True)
 
 
 class Cause(NamedTuple):
-    """The mistake that explains what was measured.
+    """The error that explains the measurements.
 
     Attributes:
         name: its short name, such as "poses inverted".
-        evidence: how well it explains, such as "inverted, the epipolar error falls from 34 px to 0.16 px".
+        evidence: the effect of the correction, such as "inverted, epipolar error: 0.16 instead of 34 px".
         remedy: what to do, one sentence.
     """
 
@@ -89,7 +89,7 @@ class Gap(NamedTuple):
     """Why nothing could be measured.
 
     Attributes:
-        reason: what is missing, such as "no mesh lies beside the voxels".
+        reason: what is missing, such as "there is no mesh beside the voxels".
         remedy: what to do for a verdict, one sentence.
     """
 
@@ -98,40 +98,40 @@ class Gap(NamedTuple):
 
 
 class Findings(NamedTuple):
-    """What an examination found.
+    """The result of an examination.
 
     Attributes:
-        facts: what is there, as (name, text) lines: counts, sizes, focal lengths, baselines, depth ranges.
-        checks: what was measured; empty where nothing can be.
-        cause: the likely mistake, where one is found; a mistake may be found though all checks pass.
-        remarks: what else a reader should know, such as views that disagree with the others.
+        facts: (name, text) lines: counts, sizes, focal lengths, baselines, depth ranges.
+        checks: what was measured; empty if nothing can be.
+        cause: the likely cause, if one is found; it may be found although all checks pass.
+        remarks: further hints, such as errors that these checks cannot detect.
         kind: what was examined.
-        gap: why nothing could be measured, where nothing could.
+        gap: why nothing could be measured, if so.
     """
 
     facts: tuple[tuple[str, str], ...]
     checks: tuple[Check, ...]
     cause: Cause | None
     remarks: tuple[str, ...] = ()
-    kind: Literal["photographs", "calibration", "voxels"] = "photographs"
+    kind: Literal["images", "calibration", "voxels"] = "images"
     gap: Gap | None = None
 
     @property
     def verdict(self) -> Literal["good", "bad", "unknown"]:
-        """Whether the geometry holds; "unknown" where nothing could be measured."""
+        """Whether the geometry is right; "unknown" if nothing could be measured."""
         if self.cause is not None or not all(check.passed for check in self.checks):
             return "bad"
         return "good" if self.checks else "unknown"
 
 
 def pixel_limit(sizes: np.ndarray) -> float:
-    """The limit of distances in photographs of sizes (V, 2), px."""
+    """The limit of distances in images of sizes (V, 2), px."""
     diagonal = float(np.median(np.hypot(*np.asarray(sizes, float).T)))
     return max(LIMITS["pixels"] * diagonal, LIMITS["fewest pixels"])
 
 
 def badness(check: Check) -> float:
-    """How far a measurement goes, as a multiple of what it may: 1 is the limit."""
+    """A measurement as a multiple of its limit: 1 is the limit."""
     part = (100 - check.value) / (100 - check.limit) if check.at_least else check.value / check.limit
     least = 1.0 if check.name == CENTRED else LEAST_BADNESS
     return float(np.clip(part, least, MOST_BADNESS)) if np.isfinite(part) else MOST_BADNESS
@@ -143,13 +143,13 @@ def report(findings: Findings) -> str:
     Example:
         >>> from lsmgeo.diagnosis.findings import Check, Findings, report
         >>> check = Check("reprojection error of sparse points", 0.25, "px", 1.2, 5931, "observations")
-        >>> print(report(Findings((("photographs", "23, 1000 x 658"),), (check,), None)))
-        photographs:      23, 1000 x 658
+        >>> print(report(Findings((("images", "23, 1000 x 658"),), (check,), None)))
+        images:           23, 1000 x 658
         <BLANKLINE>
         check                                      measured         limit
         reprojection error of sparse points         0.25 px  <=   1.2 px  ok      5931 observations
         <BLANKLINE>
-        verdict:          good: cameras and what they saw belong together
+        verdict:          good: the cameras fit the data
     """
     lines = [f"{name + ':':<17} {text}" for name, text in findings.facts]
     if findings.checks:
@@ -163,13 +163,13 @@ def _concluded(findings: Findings) -> list[tuple[str, str]]:
     good, bad = VERDICTS[findings.kind]
     if cause is not None:
         return [
-            ("verdict", f"BAD, the likely mistake: {cause.name}"),
+            ("verdict", f"BAD, the likely cause: {cause.name}"),
             ("because", cause.evidence),
             ("remedy", cause.remedy),
         ]
     if findings.verdict != "unknown":
         return [("verdict", f"good: {good}" if findings.verdict == "good" else f"BAD: {bad}")]
-    verdict = ("verdict", "unknown: nothing here could be measured")
+    verdict = ("verdict", "unknown: nothing could be measured")
     return [verdict] if gap is None else [verdict, ("because", gap.reason), ("what to do", gap.remedy)]
 
 
@@ -182,12 +182,12 @@ def _line(check: Check) -> str:
 
 
 def counted(count: int, things: str) -> str:
-    """A number of things, in the singular where there is one.
+    """A number of things, in the singular for one.
 
     Example:
         >>> from lsmgeo.diagnosis.findings import counted
-        >>> counted(2, "photographs"), counted(1, "photographs"), counted(1, "matches")
-        ('2 photographs', '1 photograph', '1 match')
+        >>> counted(2, "images"), counted(1, "images"), counted(1, "matches")
+        ('2 images', '1 image', '1 match')
     """
     if count == 1:
         things = things.removesuffix("es" if things.endswith("ches") else "s")
@@ -195,7 +195,7 @@ def counted(count: int, things: str) -> str:
 
 
 def format_value(value: float) -> str:
-    """A measurement in three digits; what is beyond measure in words.
+    """A measurement in three digits, or "infinite" or "unknown".
 
     Example:
         >>> from lsmgeo.diagnosis.findings import format_value
@@ -204,9 +204,9 @@ def format_value(value: float) -> str:
     """
     if np.isnan(value):
         return "unknown"
-    if abs(value) >= BEYOND:
+    if abs(value) >= LARGEST:
         return "infinite"
-    # Close to all and all are not the same.
+    # Nearly 100 % is never rounded to 100 %.
     if 99 < value < 100:
         return f"{np.floor(value * 100) / 100:.4g}"
     return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"

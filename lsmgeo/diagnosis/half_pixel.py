@@ -1,4 +1,4 @@
-"""Whether principal points are half a pixel off, which is too little to fail a check and enough to spoil depth."""
+"""A common shift of the principal points by half a pixel: too small to fail a check, large enough to spoil depth."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ __all__ = ["Shift", "find_shifts", "is_certain", "is_half_a_pixel", "is_large", 
 
 STEP = 0.25  # px, for derivatives
 ITERATIONS = 20
-# Real calibrations are off by so much, px, and more by chance: half a pixel has to be this much likelier than none.
+# Error of real calibrations, px, besides chance; and by how much half a pixel must be likelier than no shift.
 SYSTEMATIC, LEAST_GAIN = 0.12, 9.0
-# What is another shift than that by half a pixel is none, however large it is.
+# A shift that differs more than this from half a pixel is another one, however large it is.
 MOST_LEFT = 16.0
-# Shifts less certain than this, px, tell nothing of half a pixel along both axes.
+# Largest standard error, px, at which half a pixel can be detected.
 LARGEST_ERROR = 0.35
 LARGE = 1.0  # px
-# Errors of the views' own calibration are told from a common one by leaving views out: fewer tell nothing.
+# Fewer views are too few for the jackknife, which separates errors of single views from a common one.
 LEAST_VIEWS = 4
-LARGEST_SLOPE = 10.0  # an epipole nearby
+LARGEST_SLOPE = 10.0  # larger near an epipole
 LEAST_OBSERVED, LEAST_RESIDUALS = 10, 30
 DIAGONAL = np.linspace(-1.0, 1.0, 9)
 FARTHEST_TANGENT = 1.0  # px
 
 
 class Shift(NamedTuple):
-    """By how much all principal points seem to be too large, in px.
+    """By how much all principal points are too large, px.
 
     Attributes:
-        source: what was looked at.
+        source: the evidence it is inferred from.
         x: along x.
         y: along y.
         error_x: standard error of x.
@@ -53,7 +53,7 @@ class Shift(NamedTuple):
 
 
 def find_shifts(evidence: Sequence[Evidence], cameras: Geometry) -> list[Shift]:
-    """What each kind of evidence says of a common shift of the principal points."""
+    """The common shift of the principal points, inferred from each kind of evidence."""
     found = []
     for item in evidence:
         if isinstance(item, Points):
@@ -69,7 +69,7 @@ def find_shifts(evidence: Sequence[Evidence], cameras: Geometry) -> list[Shift]:
 
 
 def is_half_a_pixel(shift: Shift) -> bool:
-    """Whether half a pixel along both axes, to the same side, is much likelier than nothing, and is what was found.
+    """Whether a shift is half a pixel along both axes, with the same sign, and not zero.
 
     Example:
         >>> from lsmgeo.diagnosis.half_pixel import Shift, is_half_a_pixel
@@ -85,7 +85,7 @@ def is_half_a_pixel(shift: Shift) -> bool:
 
 
 def nearer_half(shift: Shift) -> float:
-    """Which of the two half pixels along both axes a shift is nearer to, as certain as each axis is.
+    """Which of 0.5 and -0.5 along both axes a shift is closer to, relative to its errors.
 
     Example:
         >>> from lsmgeo.diagnosis.half_pixel import Shift, nearer_half
@@ -101,13 +101,13 @@ def _distance(shift: Shift, expected: float) -> float:
 
 
 def is_large(shift: Shift) -> bool:
-    """Whether principal points are certainly off by more than a pixel."""
+    """Whether principal points are off by significantly more than a pixel."""
     found, errors = np.abs([shift.x, shift.y]), np.array([shift.error_x, shift.error_y])
     return is_certain(shift) and bool((found - 3 * errors > LARGE).any())
 
 
 def is_certain(shift: Shift) -> bool:
-    """Whether a shift of half a pixel would have been seen."""
+    """Whether a shift of half a pixel would have been detected."""
     return max(shift.error_x, shift.error_y) <= LARGEST_ERROR
 
 
@@ -115,7 +115,7 @@ _STEPS = ((0.0, 0.0), (STEP, 0.0), (-STEP, 0.0), (0.0, STEP), (0.0, -STEP))
 
 
 def _shift_of_points(points: Points, cameras: Geometry) -> Shift | None:
-    """Medians of what projects beside its observation, over views."""
+    """Mean over views of the median reprojection residual."""
     medians = []
     for view, observed in enumerate(points.points.observations):
         if len(observed.points) >= LEAST_OBSERVED:
@@ -127,44 +127,44 @@ def _shift_of_points(points: Points, cameras: Geometry) -> Shift | None:
     return Shift("sparse points", *(float(value) for value in (*mean, *errors)))
 
 
-def _shift_of_silhouettes(outlines: Silhouettes, cameras: Geometry) -> Shift | None:
-    """Where along the diagonal the tangents' squared distances are least, which have no sign to be followed."""
-    views = np.array(outlines.pairs)
-    if len(outlines.outlines) < LEAST_VIEWS:
+def _shift_of_silhouettes(silhouettes: Silhouettes, cameras: Geometry) -> Shift | None:
+    """The shift along the diagonal with the least squared tangent distances, which have no sign to follow."""
+    views = np.array(silhouettes.pairs)
+    if len(silhouettes.contours) < LEAST_VIEWS:
         return None
     costs = []
     for shift in DIAGONAL:
-        distances = np.minimum(outlines.distances(cameras.shifted(-shift, -shift), outlines.pairs), FARTHEST_TANGENT)
-        costs.append(np.nansum(distances**2, axis=1))
+        distances = silhouettes.distances(cameras.shifted(-shift, -shift), silhouettes.pairs)
+        costs.append(np.nansum(np.minimum(distances, FARTHEST_TANGENT) ** 2, axis=1))
     table = np.array(costs)  # (S, P)
 
     def lowest(chosen: np.ndarray) -> float:
         sums = table[:, chosen].sum(1)
         middle = int(np.clip(sums.argmin(), 1, len(sums) - 2))
         before, here, after = sums[middle - 1 : middle + 2]
-        bend = before - 2 * here + after
-        aside = 0.5 * (before - after) / bend if bend > 0 else 0.0
-        return float(DIAGONAL[middle] + np.clip(aside, -1, 1) * (DIAGONAL[1] - DIAGONAL[0]))
+        curvature = before - 2 * here + after
+        offset = 0.5 * (before - after) / curvature if curvature > 0 else 0.0
+        return float(DIAGONAL[middle] + np.clip(offset, -1, 1) * (DIAGONAL[1] - DIAGONAL[0]))
 
     best = lowest(np.ones(len(views), bool))
-    without = np.array([lowest((views != view).all(1)) for view in sorted(outlines.outlines)])
+    without = np.array([lowest((views != view).all(1)) for view in sorted(silhouettes.contours)])
     error = _jackknife_errors(without[:, None])[0]
-    return Shift("outlines", best, best, float(error), float(error))
+    return Shift("silhouettes", best, best, float(error), float(error))
 
 
 def _jackknife_errors(without: np.ndarray) -> np.ndarray:
-    """Standard errors from estimates (V, K) without one view each: pairs of one view share its errors."""
+    """Jackknife standard errors of estimates (V, K), each without one view: pairs of one view share its errors."""
     spread = without - without.mean(0)
     return np.asarray(np.sqrt((len(without) - 1) / len(without) * (spread**2).sum(0)) + 1e-6)
 
 
 def _robust_shift(source: str, found: np.ndarray, pair: np.ndarray, views: np.ndarray) -> Shift | None:
-    """The shift that makes signed residuals least, with robust weights; its errors by leaving out views.
+    """The shift that minimises signed residuals, with robust weights, and its jackknife errors.
 
     Args:
-        source: what the residuals are of.
+        source: the evidence of the residuals.
         found: (5, M) residuals at no shift and at the steps along +x, -x, +y, -y.
-        pair: (M,) which pair of views each one is of.
+        pair: (M,) the pair of views of each one.
         views: (P, 2) the views of each pair.
     """
     slopes = np.stack([found[1] - found[2], found[3] - found[4]], 1) / (2 * STEP)
@@ -193,5 +193,5 @@ def _robust_shift(source: str, found: np.ndarray, pair: np.ndarray, views: np.nd
             return None
         without.append(np.linalg.solve(normals[kept].sum(0), rights[kept].sum(0)))
     errors = _jackknife_errors(np.array(without))
-    # Residuals vanish at cameras shifted by ``shift``: as they are, they are too large by its opposite.
+    # Residuals vanish at cameras shifted by ``shift``: the stated ones are too large by its negative.
     return Shift(source, *(float(value) for value in (*-shift, *errors)))

@@ -1,4 +1,4 @@
-"""What is there, told in lines, and what looks implausible before anything is measured."""
+"""A scene in lines of facts, implausible cameras, and why nothing could be measured."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["describe_scene", "find_gap", "implausibilities"]
 
 NARROWEST, WIDEST = 5.0, 170.0  # degrees
 MOST_ANISOTROPIC = 1.2
-# Photographs whose features are counted to say why none match.
+# Images whose features are counted to explain why none match.
 MOST_COUNTED = 8
 
 
@@ -31,16 +31,16 @@ def describe_scene(
     scene: PosedImages, views: np.ndarray, evidence: Sequence[Evidence], stated: Hypothesis, sizes: np.ndarray
 ) -> list[tuple[str, str]]:
     """Facts as (name, text)."""
-    cameras = stated.photographs
-    facts = [("format", scene.source), ("photographs", f"{len(scene)}, {_sizes(sizes)}")]
+    cameras = stated.cameras
+    facts = [("format", scene.source), ("images", f"{len(scene)}, {_sizes(sizes)}")]
     if len(views) < len(scene):
-        facts.append(("looked at", f"{len(views)} of them (at most {MAX_VIEWS}), in runs of successive ones"))
+        facts.append(("measured", f"{len(views)} of them (at most {MAX_VIEWS}), in runs of successive ones"))
     angles = field_of_view(cameras, sizes)
     facts.append(("focal length", f"{_range(cameras.K[:, 0, 0])} x {_range(cameras.K[:, 1, 1])} px"))
     facts.append(("field of view", f"{_range(angles[:, 0])} x {_range(angles[:, 1])} degrees"))
     facts.append(("principal point", f"{_range(cameras.K[:, 0, 2])}, {_range(cameras.K[:, 1, 2])} px"))
     if scene.lenses is not None:
-        facts.append(("lenses", f"{sum(lens is not None for lens in scene.lenses)} with distortion, straightened"))
+        facts.append(("lenses", f"{sum(lens is not None for lens in scene.lenses)} with distortion, undistorted"))
     if len(scene) > 1:
         apart = np.linalg.norm(cameras.centers[:, None] - cameras.centers, axis=2)
         near = np.sort(apart, axis=1)[:, 1]
@@ -60,11 +60,11 @@ def describe_scene(
 def _facts_of(item: Evidence, stated: Hypothesis) -> list[tuple[str, str]]:
     if isinstance(item, Features):
         matches = item.matches
-        seen = len(np.unique(np.concatenate([matches.first, matches.second])))
-        text = f"{len(matches.pair)} in {counted(len(matches.first), 'pairs')} of {seen} photographs"
+        matched = len(np.unique(np.concatenate([matches.first, matches.second])))
+        text = f"{len(matches.pair)} in {counted(len(matches.first), 'pairs')} of {matched} images"
         return [("matched features", text)]
     if isinstance(item, Silhouettes):
-        return [("outlines", f"{len(item.outlines)} seen whole")]
+        return [("silhouettes", f"{len(item.contours)} inside their images")]
     if isinstance(item, (DepthMaps, StereoPair)):
         depths = np.concatenate(item.surfaces.depths)
         low, high = np.percentile(depths, (2, 98))
@@ -78,42 +78,41 @@ def _facts_of(item: Evidence, stated: Hypothesis) -> list[tuple[str, str]]:
 
 
 def find_gap(scene: PosedImages) -> Gap:
-    """Why nothing about photographs could be measured, and what would let it.
+    """Why nothing could be measured about images, and what to add.
 
     Raises:
-        DataError: a photograph is missing or damaged.
+        DataError: an image is missing or damaged.
     """
-    besides = "depth maps, sparse points, or cut-out photographs of a solid"
+    others = "depth maps, sparse points, or cut-out images with voxels"
     if len(scene) == 1:
-        remedy = "Add a photograph, with its camera, that sees the same from another place."
-        return Gap("the one photograph has no partner to be compared with", remedy)
+        return Gap("there is only one image", "Add an image of the same object from another place, with its camera.")
     views = choose_views(len(scene))
-    looked = views[evenly(len(views), MOST_COUNTED)]
-    counts = count_features(scene, looked)
-    among = counted(len(scene), "photographs")
-    if len(looked) < len(scene):
-        among = f"the {len(looked)} of {among} that were looked at"
+    chosen = views[evenly(len(views), MOST_COUNTED)]
+    counts = count_features(scene, chosen)
+    among = counted(len(scene), "images")
+    if len(chosen) < len(scene):
+        among = f"the {len(chosen)} of {among} that were measured"
     if counts.max() == 0:
-        reason, remedy = f"no features were found in {among}", f"They are blank or blurred: add {besides}."
+        reason, remedy = f"no features were found in {among}", f"They are blank or blurred: add {others}."
     elif counts.max() < LEAST_VERIFIED:
         reason = f"hardly any features, at most {counts.max()}, were found in {among}"
-        remedy = f"{LEAST_VERIFIED} that match are needed: take larger or sharper photographs, or add {besides}."
+        remedy = f"{LEAST_VERIFIED} matches are needed: use larger or sharper images, or add {others}."
     else:
-        among = counted(len(views), "photographs")
-        reason = f"no two of {among} have matched features (each has some {np.median(counts):.0f})"
+        among = counted(len(views), "images")
+        reason = f"no two of {among} have matched features (each has about {np.median(counts):.0f} features)"
         remedy = (
-            "Add photographs in between, so that neighbours see the same thing from directions less than 30 degrees "
-            f"apart, or add {besides}."
+            "Add images in between, so that neighbours see the same object from directions less than 30 degrees apart, "
+            f"or add {others}."
         )
     return Gap(reason, remedy)
 
 
 def implausibilities(cameras: Geometry, sizes: np.ndarray) -> list[str]:
-    """Remarks on what cameras seldom are."""
+    """Remarks on unusual cameras."""
     remarks = []
     far = principal_offsets(cameras, sizes).max(1) > LIMITS["centred"] / 100
     if far.any():
-        remarks.append(f"the principal point is far from the middle of {_some(far)}: K of another size, or a crop?")
+        remarks.append(f"the principal point is far from the centre of {_some(far)}: K of another size, or a crop?")
     angles = field_of_view(cameras, sizes)
     odd = (angles.min(1) < NARROWEST) | (angles.max(1) > WIDEST)
     if odd.any():
@@ -126,7 +125,7 @@ def implausibilities(cameras: Geometry, sizes: np.ndarray) -> list[str]:
     if len(centers) > 1:
         spread = np.linalg.norm(centers - centers.mean(0), axis=1).max()
         if spread <= 1e-9 * max(np.abs(centers).max(), 1e-300):
-            remarks.append("all cameras are in one place: there is no baseline, and depth cannot be told")
+            remarks.append("all cameras are in one place: there is no baseline, so no depth can be computed")
     return remarks
 
 
@@ -140,8 +139,8 @@ def field_of_view(cameras: Geometry, sizes: np.ndarray) -> np.ndarray:
 
 def _some(chosen: np.ndarray) -> str:
     if len(chosen) == 1:
-        return "the photograph"
-    return "all photographs" if chosen.all() else f"{chosen.sum()} of {len(chosen)} photographs"
+        return "the image"
+    return "all images" if chosen.all() else f"{chosen.sum()} of {len(chosen)} images"
 
 
 def _sizes(sizes: np.ndarray) -> str:

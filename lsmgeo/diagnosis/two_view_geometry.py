@@ -1,4 +1,4 @@
-"""Cameras as plain matrices, so that they may be changed into what no camera is, and what follows from two of them."""
+"""Cameras as plain matrices, hypotheses about them, and the epipolar geometry of two views."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ __all__ = [
     "stated_hypothesis",
 ]  # fmt: skip
 
-# A baseline below this fraction of the cameras' distance from the origin is rounding.
+# A baseline shorter than this fraction of the cameras' distance from the origin is rounding error.
 NO_BASELINE = 1e-9
 
 
 class Geometry(NamedTuple):
-    """V cameras ``x ~ K (R X + t)`` in integer pixels; R is any regular matrix, for mirrored cameras are tried too."""
+    """V cameras ``x ~ K (R X + t)``, integer pixel centres; R is any invertible matrix: hypotheses include mirrors."""
 
     K: np.ndarray  # (V, 3, 3)
     R: np.ndarray  # (V, 3, 3)
@@ -28,61 +28,61 @@ class Geometry(NamedTuple):
 
     @property
     def centers(self) -> np.ndarray:
-        """Where the cameras are, (V, 3)."""
+        """Camera centres, (V, 3)."""
         return -np.linalg.solve(self.R, self.t[..., None])[..., 0]
 
-    def taken(self, order: np.ndarray) -> Geometry:
-        """The cameras in another order."""
-        return Geometry(self.K[order], self.R[order], self.t[order])
+    def select(self, index: np.ndarray) -> Geometry:
+        """The cameras with these indices, in this order."""
+        return Geometry(self.K[index], self.R[index], self.t[index])
 
     def shifted(self, x: float, y: float) -> Geometry:
-        """The principal points moved by so many pixels."""
+        """The cameras with their principal points moved by (x, y) px."""
         return self._replace(K=self.K + np.array([[0, 0, x], [0, 0, y], [0, 0, 0]]))
 
 
 class Hypothesis(NamedTuple):
-    """What the geometry would be, were it not for some mistake.
+    """Cameras, and a reading of the depth, to be tested.
 
     Attributes:
-        photographs: the camera of each photograph, (V,).
-        beside: the camera of what came beside each photograph, depth and sparse points; the same one unless
-            photographs alone are out of order.
-        depth_scale: what depth is multiplied with.
-        along_ray: whether depth is the distance from the camera's centre.
+        cameras: the camera of each image, (V,).
+        depth_cameras: the camera of each depth map and of each image's sparse points; the same as ``cameras`` unless
+            only the images are out of order.
+        depth_scale: factor on the depth.
+        along_ray: whether depth is the distance from the camera centre.
     """
 
-    photographs: Geometry
-    beside: Geometry
+    cameras: Geometry
+    depth_cameras: Geometry
     depth_scale: float = 1.0
     along_ray: bool = False
 
 
 def stated_hypothesis(scene: PosedImages) -> Hypothesis:
-    """The cameras that the scene has, float64."""
+    """The cameras that the scene states, float64."""
     K, E = (np.array(torch.as_tensor(value).double()) for value in scene.cameras[:2])
     geometry = Geometry(K, E[:, :3, :3].copy(), E[:, :3, 3].copy())
     return Hypothesis(geometry, geometry)
 
 
 def evenly(count: int, most: int) -> np.ndarray:
-    """At most so many of ``count`` indices, evenly chosen: the same ones each time."""
+    """At most ``most`` of ``count`` indices, evenly spaced."""
     return np.linspace(0, count - 1, min(most, count)).astype(int)
 
 
 def scaling(x: float, y: float) -> np.ndarray:
-    """S (3, 3): ``S K`` is for pictures x times as wide and y times as high, see `lsmgeo.cameras.resize`."""
+    """S (3, 3): ``S K`` is for images x times as wide and y times as high, see `lsmgeo.cameras.resize`."""
     return np.array([[x, 0, 0.5 * x - 0.5], [0, y, 0.5 * y - 0.5], [0, 0, 1]])
 
 
 def homogeneous(pixels: np.ndarray) -> np.ndarray:
-    """(..., 2) with a third coordinate 1."""
+    """Homogeneous coordinates: (..., 2) with a third coordinate 1."""
     return np.concatenate([pixels, np.ones((*pixels.shape[:-1], 1))], -1)
 
 
 def relative(geometry: Geometry, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A (P, 3, 3) and b (P, 3) with ``X2 = A X1 + b`` from the first cameras' coordinates to the second ones'.
+    """A (P, 3, 3) and b (P, 3) with ``X2 = A X1 + b``, from the first camera's coordinates to the second camera's.
 
-    Where two cameras are in one place, b is exactly zero.
+    Without a baseline, b is exactly zero.
     """
     inverse = np.linalg.inv(geometry.R)
     A = geometry.R[second] @ inverse[first]
@@ -93,7 +93,7 @@ def relative(geometry: Geometry, first: np.ndarray, second: np.ndarray) -> tuple
 
 
 def fundamental(geometry: Geometry, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """F (P, 3, 3) with ``x2^T F x1 = 0``; zero where two cameras are in one place.
+    """F (P, 3, 3) with ``x2^T F x1 = 0``; zero without a baseline.
 
     Equation: F = K2^-T [b]x A K1^-1 (Hartley and Zisserman, "Multiple View Geometry", equation 9.2).
     """

@@ -31,34 +31,34 @@ def run(path, out, capsys):
     return status, capsys.readouterr()
 
 
-def test_a_good_scene_is_told_with_status_0(traced, tmp_path, capsys):
+def test_a_good_scene_has_status_0(traced, tmp_path, capsys):
     status, printed = run(middlebury(traced, tmp_path / "scene", traced.E), tmp_path / "out", capsys)
     assert status == 0
     assert printed.err == ""
     lines = printed.out.splitlines()
     assert "format:           middlebury" in lines
-    assert "photographs:      4, 320 x 240" in lines
-    assert "verdict:          good: cameras and what they saw belong together" in lines
+    assert "images:           4, 320 x 240" in lines
+    assert "verdict:          good: the cameras fit the data" in lines
     (line,) = [line for line in lines if line.startswith("epipolar error of matched features")]
     assert " ok " in line
     assert len(lines) <= 25
     assert max(map(len, lines)) < 200
     for name in ("cameras.png", "matches.png"):
         assert str((tmp_path / "out" / name).resolve()) in printed.out
-        with Image.open(tmp_path / "out" / name) as picture:
-            assert min(picture.size) > 300
-            assert np.asarray(picture.convert("RGB")).std() > 5
+        with Image.open(tmp_path / "out" / name) as image:
+            assert min(image.size) > 300
+            assert np.asarray(image.convert("RGB")).std() > 5
 
 
-def test_a_mistake_is_told_with_status_1(traced, tmp_path, capsys):
+def test_an_error_has_status_1(traced, tmp_path, capsys):
     status, printed = run(middlebury(traced, tmp_path / "scene", np.linalg.inv(traced.E)), tmp_path / "out", capsys)
     assert status == 1
-    assert "verdict:          BAD, the likely mistake: poses inverted" in printed.out
+    assert "verdict:          BAD, the likely cause: poses inverted" in printed.out
     assert "remedy:" in printed.out
     assert "FAILED" in printed.out
 
 
-def test_what_cannot_be_read_is_told_with_status_2(traced, tmp_path, capsys):
+def test_what_cannot_be_read_has_status_2(traced, tmp_path, capsys):
     status, printed = run(tmp_path / "nowhere", tmp_path / "out", capsys)
     assert status == 2
     assert "no such file or folder" in printed.err
@@ -70,12 +70,12 @@ def test_what_cannot_be_read_is_told_with_status_2(traced, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_nothing_measured_is_told_with_status_3(traced, tmp_path, capsys):
+def test_nothing_measured_has_status_3(traced, tmp_path, capsys):
     blank = type(traced)(traced.K, traced.E, np.full_like(traced.images, 99), traced.depth, traced.mask)
     status, printed = run(middlebury(blank, tmp_path / "scene", traced.E), tmp_path / "out", capsys)
     assert status == 3
-    assert "unknown: nothing here could be measured" in printed.out
-    assert "because:          no features were found in 4 photographs" in printed.out
+    assert "unknown: nothing could be measured" in printed.out
+    assert "because:          no features were found in 4 images" in printed.out
     assert "what to do:       They are blank or blurred: add" in printed.out
     assert "check " not in printed.out
 
@@ -93,24 +93,24 @@ def test_the_other_commands_return_0_as_before(tmp_path, capsys):
     assert cli.main(["reconstruct", str(scene), "--size", "48", "--out", str(tmp_path / "out")]) == 0
 
 
-def test_what_is_no_photographs_goes_to_its_own_examination(tmp_path, capsys, monkeypatch):
+def test_voxels_have_their_own_examination(tmp_path, capsys, monkeypatch):
     content = np.zeros((2, 2, 2), np.uint8)
     content[0] = 1
     header = b"#binvox 1\ndim 2 2 2\ntranslate 0 0 0\nscale 1\ndata\n"
     (tmp_path / "solid.binvox").write_bytes(header + bytes([1, 4, 0, 4]))
     status, printed = run(tmp_path / "solid.binvox", tmp_path / "out", capsys)
     assert status == 3
-    assert "because:          no mesh lies beside the voxels" in printed.out
-    assert printed.out.splitlines()[-1] == "no pictures are drawn of voxels alone"
+    assert "because:          there is no mesh beside the voxels" in printed.out
+    assert printed.out.splitlines()[-1] == "no figures are drawn of voxels only"
     assert not (tmp_path / "out").exists()
 
 
-def test_a_single_photograph_has_no_partner(tmp_path, capsys):
+def test_a_single_image_cannot_be_compared(tmp_path, capsys):
     alone = trace(*on_an_arc(1))
     status, printed = run(middlebury(alone, tmp_path / "scene", alone.E), tmp_path / "out", capsys)
     assert status == 3
-    assert "the one photograph has no partner" in printed.out
-    assert "1 photographs" not in printed.out
+    assert "there is only one image" in printed.out
+    assert "1 images" not in printed.out
     assert (tmp_path / "out" / "cameras.png").exists()
 
 

@@ -1,4 +1,4 @@
-"""Mistakes in cameras leave the photographs alone: each set of them is matched once."""
+"""Errors in cameras do not change the images: each set of images is matched once."""
 
 import pytest
 

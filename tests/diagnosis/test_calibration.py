@@ -1,4 +1,4 @@
-"""Calibrations of rendered chessboards: the truth passes, and each planted mistake fails and is named."""
+"""Calibrations of rendered chessboards: the truth passes, and each planted error fails and is reported."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +27,7 @@ OPENGL, FLIP = np.diag([1.0, -1.0, -1.0]), np.diag([1.0, -1.0, 1.0])
 
 
 def poses():
-    """Board-to-first-camera, lengths in squares: the board before the camera, tilted and turned."""
+    """Board-to-first-camera, lengths in squares: the board in front of the camera, tilted and rotated."""
     rng = np.random.default_rng(3)
     for _ in range(7):
         turn = cv2.Rodrigues(rng.uniform([-0.5, -0.5, -0.3], [0.5, 0.5, 0.3]))[0]
@@ -36,7 +36,7 @@ def poses():
 
 
 def render(K, coefficients, turn, shift):
-    """A photograph of the board, 3 x 3 rays a pixel; the distortion is undone by iterating its definition."""
+    """An image of the board, 3 x 3 rays per pixel; the distortion is inverted by fixed-point iteration."""
     steps = (np.arange(3) - 1) / 3
     v, u = ((np.arange(n)[:, None] + steps).ravel() for n in SIZE)
     x, y = np.meshgrid(((u - K[0, 2]) / K[0, 0]).astype(np.float32), ((v - K[1, 2]) / K[1, 1]).astype(np.float32))
@@ -99,7 +99,7 @@ def test_the_truth_is_good(truth):
     assert findings.remarks == ()
     assert set(values(findings)) == {
         "rms of a stereo calibration from scratch", "rms under the lens first", "rms under the lens second",
-        "rms of corners carried by the rig",
+        "rms of corners transferred by the rig",
     }  # fmt: skip
     assert max(values(findings).values()) < 0.2
     assert all(check.measured in (7 * 54, 14 * 54) for check in findings.checks)
@@ -119,29 +119,29 @@ RIGS = {
 
 
 @pytest.mark.parametrize("name", RIGS)
-def test_a_mistake_in_the_rig_is_named(truth, name):
+def test_an_error_in_the_rig_is_reported(truth, name):
     rotation, translation = RIGS[name]
     findings = examine_calibration(with_rig(truth, rotation, translation * SQUARE), HERE)
     assert findings.verdict == "bad"
     assert findings.cause.name == name
-    assert values(findings)["rms of corners carried by the rig"] > 1
+    assert values(findings)["rms of corners transferred by the rig"] > 1
     assert "falls from" in findings.cause.evidence
 
 
 @pytest.mark.parametrize("scale", [0.5, 2.0, 1.5])
-def test_k_of_another_resolution_is_named(truth, scale):
+def test_k_of_another_resolution_is_reported(truth, scale):
     wrong = with_lenses(truth, lambda lens: np.diag([scale, scale, 1]) @ lens.intrinsics)
     findings = examine_calibration(wrong, HERE)
     assert findings.verdict == "bad"
     assert findings.cause.name == "K of another resolution"
     stated = float(findings.cause.evidence.split("with K times ")[1].split(",")[0])
     np.testing.assert_allclose(stated, 1 / scale, rtol=0.02)
-    # The rig is judged by itself, with lenses from the pictures.
-    assert values(findings)["rms of corners carried by the rig"] < 1
+    # The rig is measured with lenses calibrated from the images.
+    assert values(findings)["rms of corners transferred by the rig"] < 1
 
 
 @pytest.mark.parametrize("order", [(1, 2, 3, 4, 5, 6, 0), (1, 0, 2, 3, 4, 5, 6), (6, 5, 4, 3, 2, 1, 0)])
-def test_shuffled_frames_are_named_and_paired(truth, order):
+def test_shuffled_frames_are_reported_and_paired(truth, order):
     first, second = truth.images
     findings = examine_calibration(replace(truth, images=(first, tuple(second[index] for index in order))), HERE)
     assert findings.verdict == "bad"
@@ -150,28 +150,28 @@ def test_shuffled_frames_are_named_and_paired(truth, order):
     assert "left0.png with right0.png, left1.png with right1.png" in findings.cause.remedy
 
 
-def test_half_a_pixel_is_below_the_power_of_a_board(truth):
+def test_half_a_pixel_cannot_be_detected_with_a_board(truth):
     shift = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     findings = examine_calibration(with_lenses(truth, lambda lens: lens.intrinsics + shift), HERE)
     assert findings.verdict == "good"
 
 
-def test_another_lens_is_named(truth):
-    bent = {name: replace(lens, coefficients=(0.6, -1.0, 0.0, 0.0)) for name, lens in truth.lenses.items()}
-    findings = examine_calibration(replace(truth, lenses=bent), HERE)
-    assert findings.cause.name == "lens of other pictures"
-    assert "the lens bends the other way, k1 is stated as +0.6 and measured as -0." in findings.cause.evidence
+def test_another_lens_is_reported(truth):
+    other = {name: replace(lens, coefficients=(0.6, -1.0, 0.0, 0.0)) for name, lens in truth.lenses.items()}
+    findings = examine_calibration(replace(truth, lenses=other), HERE)
+    assert findings.cause.name == "lens of other images"
+    assert "the distortion has the opposite sign: k1 is stated as +0.6 and measured as -0." in findings.cause.evidence
 
 
-def test_both_cameras_are_told_apart(truth):
+def test_both_cameras_have_their_facts(truth):
     findings = examine_calibration(truth, HERE)
     names = [name for name, _ in findings.facts]
     assert len(names) == len(set(names))
     assert {"first camera anew", "second camera anew"} <= set(names)
-    assert "good: lenses and pictures of the board agree" in report(findings)
+    assert "good: the lenses fit the images of the board" in report(findings)
 
 
-def test_exchanged_lenses_are_named(truth):
+def test_exchanged_lenses_are_reported(truth):
     lenses = {"first": truth.lenses["second"], "second": truth.lenses["first"]}
     findings = examine_calibration(replace(truth, lenses=lenses), HERE)
     assert findings.cause.name == "left and right exchanged"
@@ -206,34 +206,34 @@ def test_stated_poses_of_the_board_are_compared(truth):
     for name, change in VIEWS.items():
         findings = examine_calibration(one_camera(truth, change), HERE)
         assert findings.cause.name == name
-    turned = replace(one_camera(truth), images=(truth.images[0][1:] + truth.images[0][:1],))
-    assert examine_calibration(turned, HERE).cause.name == "frames shuffled"
+    shifted = replace(one_camera(truth), images=(truth.images[0][1:] + truth.images[0][:1],))
+    assert examine_calibration(shifted, HERE).cause.name == "frames shuffled"
 
 
 def test_what_cannot_be_measured_is_unknown(truth, tmp_path):
     findings = examine_calibration(replace(truth, images=()), HERE)
     assert (findings.verdict, findings.checks) == ("unknown", ())
-    assert "names no picture of a board" in findings.gap.reason
+    assert "names no image of a board" in findings.gap.reason
     Image.new("RGB", (320, 240)).save(tmp_path / "a.png")
     findings = examine_calibration(replace(truth, images=((tmp_path / "a.png",),)), HERE)
     assert findings.verdict == "unknown"
-    assert findings.gap.reason == "no board was found in 1 picture of the camera"
+    assert findings.gap.reason == "no board was found in 1 image of the camera"
     few = replace(truth, images=tuple(side[:2] for side in truth.images))
     findings = examine_calibration(few, HERE)
-    assert "Too few pictures" in findings.remarks[0]
+    assert "too few images" in findings.remarks[0]
     assert set(values(findings)) == {"rms under the lens first", "rms under the lens second"}
 
 
 def test_opencv_s_chessboards_reach_their_figure():
     folder = real_set("opencv_stereo")
-    pictures = data.read_calibration(folder / "stereo_calib.xml")
-    findings = examine_calibration(pictures, folder)
+    calibration = data.read_calibration(folder / "stereo_calib.xml")
+    findings = examine_calibration(calibration, folder)
     assert findings.verdict == "good"
     np.testing.assert_allclose(values(findings)["rms of a stereo calibration from scratch"], 0.217, atol=0.0005)
-    # Of the lenses beside them two are those of the pictures, and the first in intrinsics.yml is not.
+    # Two of the stated lenses are those of the images; the first in intrinsics.yml is not.
     findings = examine_calibration(data.read_calibration(folder), folder)
     measured = values(findings)
     np.testing.assert_allclose(measured["rms under the lens left_intrinsics"], 0.206, atol=0.005)
     np.testing.assert_allclose(measured["rms under the lens second"], 0.606, atol=0.01)
     np.testing.assert_allclose(measured["rms under the lens first"], 2.045, atol=0.02)
-    assert findings.cause.name == "lens of other pictures"
+    assert findings.cause.name == "lens of other images"

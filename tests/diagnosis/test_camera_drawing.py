@@ -1,4 +1,4 @@
-"""The drawing of cameras: its coordinates are those that its axes name."""
+"""The drawing of cameras: coordinates are those of the labelled axes."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ K = np.array([[100.0, 0, 31.5], [0, 100, 23.5], [0, 0, 1]])
 
 
 def ring(world, count=8):
-    """Cameras about the point (1, 2, 3), that look at it from two above; then the world is turned."""
+    """Cameras around the point (1, 2, 3) that look at it from two above; then the world is rotated."""
     poses = []
     for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
         center = np.array([4 * np.cos(angle), 4 * np.sin(angle), 2.0])
@@ -53,19 +53,19 @@ def test_positions_are_those_of_the_named_axes(name):
             letter, world = axis.get_label_text().split(" ")
             assert world == "(world)"
             ticks = [text.get_text().replace("\N{MINUS SIGN}", "-") for text in axis.get_majorticklabels()]
-            told = np.polyval(np.polyfit(axis.get_majorticklocs(), [float(text) for text in ticks], 1), value)
-            np.testing.assert_allclose(told, cameras.centers[3]["xyz".index(letter)], atol=1e-4)
+            shown = np.polyval(np.polyfit(axis.get_majorticklocs(), [float(text) for text in ticks], 1), value)
+            np.testing.assert_allclose(shown, cameras.centers[3]["xyz".index(letter)], atol=1e-4)
 
 
-def test_a_world_that_leans_is_said_to_be_turned():
+def test_a_tilted_world_is_drawn_rotated():
     c, s = np.cos(0.7), np.sin(0.7)
     figure = drawn(ring(np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])))
-    assert "turned so that up is up; origin at the middle of the cameras" in figure.get_supxlabel()
+    assert "rotated so that up is up; origin at the mean of the cameras" in figure.get_supxlabel()
     assert [axes.get_ylabel() for axes in figure.axes] == ["away", "up"]
-    assert all("where the optical axes meet" in axes.get_legend_handles_labels()[1] for axes in figure.axes)
+    assert all("common point of the optical axes" in axes.get_legend_handles_labels()[1] for axes in figure.axes)
 
 
-def test_all_of_thirty_cameras_on_a_ring_are_numbered_and_one_alone_is_all_seen():
+def test_thirty_cameras_on_a_ring_are_all_numbered_and_a_single_one_is_inside_the_drawing():
     above, _ = drawn(ring(np.eye(3), 30)).axes
     assert sorted(int(text.get_text()) for text in above.texts) == list(range(30))
     (axes, _) = drawn(ring(np.eye(3), 1)).axes

@@ -1,4 +1,4 @@
-"""Scenes in which it is easy to be mistaken: right ones are not accused, and what cannot be seen is said."""
+"""Difficult scenes: correct ones are good, and errors that cannot be detected are remarked."""
 
 from dataclasses import replace
 
@@ -42,21 +42,21 @@ def test_what_leaves_no_trace_is_said(tmp_path):
     for each in (scene, planted(scene, "y flipped")):
         findings = examine_images(each).findings
         assert findings.verdict == "good"
-        (remark,) = [remark for remark in findings.remarks if "no trace" in remark]
+        (remark,) = [remark for remark in findings.remarks if "cannot be detected in this data" in remark]
         assert remark.endswith(": y flipped")
     cause = examine_images(planted(scene, "OpenGL axes")).findings.cause
     assert cause is not None
     assert cause.name == "OpenGL axes"
 
 
-def test_rotations_alone_tell_inverted_poses(tmp_path):
-    """Right cameras in one place have no parallax, wrong ones do: its absence speaks against no correction."""
+def test_inverted_poses_are_inferred_from_rotations_only(tmp_path):
+    """Correct cameras in one place have no parallax, wrong ones do: its absence is no reason against a correction."""
     scene = write(trace([(0.3, 0.2, -2.2)] * 4, [0.0, 0.25, 0.5, 0.8]), tmp_path)
     cause = examine_images(planted(scene, "poses inverted")).findings.cause
     assert cause is not None
     assert "poses inverted" in (
         cause.name,
-        *cause.evidence.rpartition("cannot tell it from: ")[2].rstrip(")").split(", "),
+        *cause.evidence.rpartition("cannot distinguish it from: ")[2].rstrip(")").split(", "),
     )
 
 
@@ -64,11 +64,11 @@ def checks(pairs, bad, error):
     share = 100 * (1 - bad / pairs)
     return [
         Check("epipolar error of matched features", error, "px", 1.0, 5000, "matches"),
-        Check("pairs of photographs that agree", share, "%", 90.0, pairs, "pairs", at_least=True),
+        Check("pairs of images that agree", share, "%", 90.0, pairs, "pairs", at_least=True),
     ]
 
 
-def test_one_pair_of_few_accuses_nothing():
+def test_one_bad_pair_of_few_is_not_suspicious():
     assert not is_suspicious(checks(14, 1, 0.1))
     assert not is_decisive(checks(14, 1, 0.1), checks(14, 0, 0.1))
     assert is_suspicious(checks(40, 3, 0.1))
@@ -85,6 +85,6 @@ def test_large_shifts_are_no_half_pixels():
     assert not is_large(large._replace(error_y=2.0))
 
 
-def test_the_side_is_told_by_the_axis_that_is_certain():
+def test_the_sign_is_inferred_from_the_axis_that_is_certain():
     assert nearer_half(Shift("matched features", -0.1, 0.5, 0.3, 0.05)) == 0.5
     assert nearer_half(Shift("matched features", -0.5, 0.1, 0.05, 0.3)) == -0.5

@@ -1,4 +1,4 @@
-"""Residuals against closed forms and against loops that share nothing with them."""
+"""Residuals against closed forms and independent loops."""
 
 import itertools
 
@@ -20,7 +20,7 @@ from lsmgeo.diagnosis.residuals import (
     sampson_distances,
     view_costs,
 )
-from lsmgeo.diagnosis.silhouette_consistency import Cells, Masks, near_cells, overlap, within_a_cell
+from lsmgeo.diagnosis.silhouette_consistency import Cells, Masks, near_cells, silhouette_overlap, within_a_cell
 from lsmgeo.diagnosis.two_view_geometry import Geometry, Hypothesis
 from lsmgeo.grids import VoxelGrid
 
@@ -43,13 +43,13 @@ def cameras(count, rng):
     return Geometry(*map(np.array, (K, R, t)))
 
 
-def seen(geometry, view, points):
+def projected(geometry, view, points):
     image = (points @ geometry.R[view].T + geometry.t[view]) @ geometry.K[view].T
     return image[:, :2] / image[:, 2:]
 
 
 def matched(geometry, pairs, points, noise=0.0):
-    pixels = [np.stack([seen(geometry, a, points), seen(geometry, b, points)], 1) for a, b in pairs]
+    pixels = [np.stack([projected(geometry, a, points), projected(geometry, b, points)], 1) for a, b in pairs]
     pixels = np.concatenate(pixels) + noise * RNG.standard_normal((len(pairs) * len(points), 2, 2))
     first, second = np.array(pairs).T
     return Matches(first, second, np.repeat(np.arange(len(pairs)), len(points)), pixels)
@@ -61,14 +61,14 @@ def test_exact_matches_have_no_distance_and_lie_in_front():
     np.testing.assert_allclose(sampson_distances(matches, geometry), 0, atol=1e-9)
     front = in_front(matches, geometry)
     assert np.nanmin(front) == 1
-    # Both cameras turned by half a turn about their x axis look away from all of it.
-    turned = geometry._replace(R=np.diag([1, -1, -1]) @ geometry.R, t=geometry.t * [1, -1, -1])
-    flipped = matches._replace(pixels=matched(turned, list(itertools.combinations(range(4), 2)), points).pixels)
-    assert np.nanmax(in_front(flipped, turned)) == 0
+    # Rotated by 180 degrees about their x axes, both cameras look away from the points.
+    rotated = geometry._replace(R=np.diag([1, -1, -1]) @ geometry.R, t=geometry.t * [1, -1, -1])
+    flipped = matches._replace(pixels=matched(rotated, list(itertools.combinations(range(4), 2)), points).pixels)
+    assert np.nanmax(in_front(flipped, rotated)) == 0
 
 
 def test_sampson_distance_is_half_the_gap_of_a_sideways_pair():
-    """Two cameras side by side: lines are rows, and the nearest pair of pixels on one row is half the gap from each."""
+    """Two cameras side by side: epipolar lines are rows, and the nearest pair on one row is half the gap from each."""
     K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
     geometry = Geometry(np.stack([K, K]), np.stack([np.eye(3)] * 2), np.array([[0.0, 0, 0], [-1, 0, 0]]))
     pixels = np.array([[[100.0, 50.0], [90.0, 53.0]], [[10.0, 20.0], [4.0, 20.0]]])
@@ -87,7 +87,7 @@ def test_sampson_distance_is_the_distance_to_the_nearest_consistent_pair():
     for pixels, point in zip(matches.pixels, points, strict=True):
 
         def cost(x, pixels=pixels):
-            return sum(((seen(geometry, v, x[None])[0] - pixels[v]) ** 2).sum() for v in (0, 1))
+            return sum(((projected(geometry, v, x[None])[0] - pixels[v]) ** 2).sum() for v in (0, 1))
 
         expected.append(
             np.sqrt(minimize(cost, point, method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12}).fun)
@@ -97,9 +97,11 @@ def test_sampson_distance_is_the_distance_to_the_nearest_consistent_pair():
 
 def test_without_baseline_pixels_are_compared_through_the_rotation():
     geometry = cameras(2, RNG)
-    turn = np.array([[np.cos(0.1), 0, np.sin(0.1)], [0, 1, 0], [-np.sin(0.1), 0, np.cos(0.1)]])
+    rotation = np.array([[np.cos(0.1), 0, np.sin(0.1)], [0, 1, 0], [-np.sin(0.1), 0, np.cos(0.1)]])
     same = Geometry(
-        geometry.K, np.stack([geometry.R[0], turn @ geometry.R[0]]), np.stack([geometry.t[0], turn @ geometry.t[0]])
+        geometry.K,
+        np.stack([geometry.R[0], rotation @ geometry.R[0]]),
+        np.stack([geometry.t[0], rotation @ geometry.t[0]]),
     )
     matches = matched(same, [(0, 1)], RNG.uniform(-1, 1, (20, 3)))
     np.testing.assert_allclose(sampson_distances(matches, same), 0, atol=1e-8)
@@ -112,7 +114,7 @@ def test_without_baseline_pixels_are_compared_through_the_rotation():
 def test_reprojection_errors_are_the_noise_that_was_added():
     geometry, points = cameras(3, RNG), RNG.uniform(-1, 1, (30, 3))
     noise = RNG.standard_normal((3, 30, 2))
-    observed = tuple(Observations(np.arange(30), seen(geometry, v, points) + noise[v]) for v in range(3))
+    observed = tuple(Observations(np.arange(30), projected(geometry, v, points) + noise[v]) for v in range(3))
     sparse = SparsePoints(points, np.zeros((30, 3), np.uint8), observed)
     errors, depths, views = reprojection_errors(sparse, geometry)
     np.testing.assert_allclose(errors, np.linalg.norm(noise, axis=2).ravel(), rtol=1e-9)
@@ -145,7 +147,7 @@ def plane_depth(size, slope):
 
 def test_depth_of_a_plane_agrees_with_itself_and_with_no_other():
     K = np.array([[200.0, 0, 50], [0, 200, 40], [0, 0, 1]])
-    # The second camera stands 1 nearer, so that all it sees is 1 nearer.
+    # The second camera is closer by 1, so all its depths are smaller by 1.
     geometry = Geometry(np.stack([K, K]), np.stack([np.eye(3)] * 2), np.array([[0.0, 0, 0], [0, 0, -1]]))
     v, u = (grid.ravel() for grid in np.mgrid[20:60, 25:75])
     maps = (plane_depth((80, 100), 0.0), plane_depth((80, 100), 0.0) - 1)
@@ -155,28 +157,28 @@ def test_depth_of_a_plane_agrees_with_itself_and_with_no_other():
     found = best_neighbour_errors(wrong, Hypothesis(geometry, geometry))
     np.testing.assert_allclose(found[0][2], 3 / 3.3 - 1)
     np.testing.assert_allclose(found[1][2], 4.3 / 4 - 1)
-    # Twice all depth is not this scene, for the cameras stay one apart.
+    # Twice the depth is inconsistent, because the cameras stay one apart.
     errors = relative_errors(surfaces, Hypothesis(geometry, geometry, depth_scale=2.0))
     np.testing.assert_allclose(np.sort(np.unique(np.round(errors, 12))), [7 / 6 - 1, 7 / 8 - 1][::-1])
 
 
-def test_a_solid_fills_its_own_silhouette_and_no_other():
+def test_voxels_fill_their_own_silhouette_and_no_other():
     K = np.array([[100.0, 0, 32], [0, 100, 32], [0, 0, 1]])
     geometry = Geometry(K[None], np.eye(3)[None], np.array([[0.0, 0, 5]]))
     grid = np.stack(np.meshgrid(*[np.arange(-0.45, 0.5, 0.1)] * 3), -1).reshape(-1, 3)
-    solid = Cells(grid, 0.1)
+    cells = Cells(grid, 0.1)
     mask = np.zeros((64, 64), bool)
     # A cube of side 1 whose front is 4.5 away spans 100 / 4.5 = 22 pixels.
     mask[21:44, 21:44] = True
-    recall, union = overlap(Masks((0,), (mask,), (1,)), solid, geometry)
+    recall, union = silhouette_overlap(Masks((0,), (mask,), (1,)), cells, geometry)
     assert recall[0] == 1
     assert union[0] > 0.85
-    recall, union = overlap(Masks((0,), (np.roll(mask, 18, 1),), (1,)), solid, geometry)
+    recall, union = silhouette_overlap(Masks((0,), (np.roll(mask, 18, 1),), (1,)), cells, geometry)
     assert recall[0] < 0.5
     assert union[0] < 0.2
 
 
-def test_points_are_at_most_a_cell_away_from_a_solid():
+def test_points_are_at_most_a_cell_away_from_voxels():
     occupied = torch.zeros(9, 9, 9, dtype=torch.bool)
     occupied[3:6, 3:6, 3:7] = True  # up to 6 along x, for the last axis is x
     near, world_from_lattice = near_cells(Voxels(occupied, VoxelGrid(9, -0.5, 8.5)))
@@ -184,7 +186,7 @@ def test_points_are_at_most_a_cell_away_from_a_solid():
     assert within_a_cell(points, near, world_from_lattice) == pytest.approx(2 / 5)
 
 
-def test_an_order_is_found_from_pairs_of_views():
+def test_a_permutation_is_inferred_from_pairs_of_views():
     rng = np.random.default_rng(4)
     count, order = 12, np.random.default_rng(9).permutation(12)
     pairs = [(view, (view + step) % count) for view in range(count - 1) for step in (1, 2)]
@@ -201,8 +203,8 @@ def test_orders_that_have_names():
     # As text a1, a10, a2; by number a1, a2, a10: the files' order is neither, and rows are paired by their ranks.
     assert orders["the names ordered by their numbers, not as text"] == [1, 0, 2]
     assert orders["the order reversed"] == [2, 1, 0]
-    assert orders["every photograph at the camera 1 place later"] == [1, 2, 0]
-    assert orders["every photograph at the camera 1 place earlier"] == [2, 0, 1]
+    assert orders["every image at the camera 1 place later"] == [1, 2, 0]
+    assert orders["every image at the camera 1 place earlier"] == [2, 0, 1]
     assert len(named_permutations(["9" * 5000, "1" * 5000])) == 2
 
 

@@ -1,4 +1,4 @@
-"""Photographs of textured solids, traced in numpy with cameras of its own making, and mistakes planted in them."""
+"""Images of textured spheres, ray-traced in numpy with cameras made here, and errors planted in them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lsmgeo.data.posed_images import Observations, SparsePoints, Voxels
 from lsmgeo.grids import VoxelGrid
 
 HEIGHT, WIDTH = 240, 320
-# Centre and radius; the last one is the room's wall, seen from inside.
+# Centre and radius; the wall is a sphere around them, seen from inside.
 SPHERES = ((np.array([0.25, 0.1, 0.0]), 0.45), (np.array([-0.4, -0.15, 0.2]), 0.35), (np.array([0.05, 0.0, -0.3]), 0.3))
 WALL = 3.5
 
@@ -43,7 +43,7 @@ class DepthInMemory(DepthFile):
 
 
 def noise(points: np.ndarray, seed: int) -> np.ndarray:
-    """Smooth noise in 0..1: values at a lattice of 64^3 random numbers, mixed between eight of them."""
+    """Smooth noise in 0..1: a lattice of 64^3 random numbers, interpolated."""
     table = np.random.default_rng(seed).random((64, 64, 64))
     base = np.floor(points).astype(int)
     part = points - base
@@ -100,7 +100,7 @@ def trace(eyes, rolls, *, texture=True, focal=330.0) -> Traced:
 
 
 def on_an_arc(count, step=11.0, distance=2.2):
-    """Eyes on an arc that also rises and falls, and how far each camera is rolled."""
+    """Camera centres on an arc that also rises and falls, and the roll of each camera."""
     angles = np.radians(step) * (np.arange(count) - count / 2)
     heights = 0.35 * np.sin(1.7 * np.arange(count))
     eyes = [(distance * np.sin(a), h, -distance * np.cos(a)) for a, h in zip(angles, heights, strict=True)]
@@ -108,7 +108,7 @@ def on_an_arc(count, step=11.0, distance=2.2):
 
 
 def write(traced: Traced, folder: Path, *, cut_out=False) -> PosedImages:
-    """The photographs with their cameras alone."""
+    """Write the images; the scene has only their cameras."""
     folder.mkdir(parents=True, exist_ok=True)
     count = len(traced.K)
     names = tuple(f"frame_{index}.png" for index in range(count))
@@ -127,7 +127,7 @@ def with_depth(scene, traced, maps=None):
 
 
 def with_points(scene, traced, *, noise_px=0.2):
-    """Points on the surfaces that the first view sees, observed wherever they are not hidden."""
+    """Points on the surfaces in the first view, observed wherever they are not occluded."""
     rng = np.random.default_rng(0)
     v, u = rng.integers(5, HEIGHT - 5, 400), rng.integers(5, WIDTH - 5, 400)
     rays = np.stack([u, v, np.ones(400)], -1) @ np.linalg.inv(traced.K[0]).T * traced.depth[0, v, u][:, None]
@@ -168,13 +168,13 @@ def matrices(scene):
 
 
 def in_order(scene, order):
-    """Photographs and what came with them, beside the cameras of others."""
+    """Images and their depth maps in another order than the cameras."""
     moved = replace(scene, paths=tuple(scene.paths[index] for index in order))
     return moved if scene.depths is None else replace(moved, depths=tuple(scene.depths[index] for index in order))
 
 
-def mistaken(K, E, mistake):
-    """K (V, 3, 3) and E (V, 4, 4) as a mistake leaves them, without the library's converters."""
+def erroneous(K, E, error):
+    """K (V, 3, 3) and E (V, 4, 4) with an error, without the library's converters."""
     gl, mirror = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([1.0, -1.0, 1.0, 1.0])
     half = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])  # (c + 1/2) / 2 - 1/2
     transposed, centred, negated = E.copy(), E.copy(), E.copy()
@@ -196,14 +196,14 @@ def mistaken(K, E, mistake):
         "K of another resolution": (half @ K, E),
         "half a pixel": (K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), E),
     }
-    return changed[mistake]
+    return changed[error]
 
 
-def planted(scene, mistake):
-    if mistake != "frames shuffled":
-        K, E = mistaken(*matrices(scene), mistake)
+def planted(scene, error):
+    if error != "frames shuffled":
+        K, E = erroneous(*matrices(scene), error)
         return with_cameras(scene, K=K, E=E)
-    # A photograph of another size is refused before anything is measured.
+    # An image of another size is refused before anything is measured.
     sizes = np.array([scene.size(view) for view in range(len(scene))])
     order, rng = np.arange(len(scene)), np.random.default_rng(3)
     for size in np.unique(sizes, axis=0):

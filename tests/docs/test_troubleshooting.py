@@ -1,4 +1,4 @@
-"""Each cure that the troubleshooting page shows undoes the mistake that it is shown for."""
+"""Each correction on the troubleshooting page fixes its error."""
 
 import ast
 import re
@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from lsmgeo import cameras
-from tests.diagnosis.textured import mistaken
+from tests.diagnosis.textured import erroneous
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "troubleshooting.rst"
 HEIGHT, WIDTH = 48, 64
 
 
-def cures() -> dict[str, str]:
+def corrections() -> dict[str, str]:
     """The code under each heading of the third rank."""
     sections = re.split(r"\n([^\n]+)\n~{3,}\n", PAGE.read_text(encoding="utf-8"))
     found = {}
@@ -35,7 +35,7 @@ def right_cameras() -> cameras.CameraTensors:
 
 
 def planted(name: str, views: cameras.CameraTensors) -> cameras.CameraTensors:
-    """The mistake, as the page has it where it has a number or an order of its own."""
+    """The error; with the number or order of the page, if the page has one."""
     K, E = views.intrinsics, views.cam_from_world
     if name == "frames shuffled":
         K, E = K[[2, 0, 1]], E[[2, 0, 1]]
@@ -44,7 +44,7 @@ def planted(name: str, views: cameras.CameraTensors) -> cameras.CameraTensors:
     elif name == "other camera axes":  # forward, left, up
         E = torch.tensor([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]).to(E) @ E
     else:
-        K, E = map(torch.from_numpy, mistaken(K.numpy(), E.numpy(), name))
+        K, E = map(torch.from_numpy, erroneous(K.numpy(), E.numpy(), name))
     return views._replace(intrinsics=K, cam_from_world=E)
 
 
@@ -64,14 +64,14 @@ OF_CAMERAS = (
 
 
 def literals() -> set[str]:
-    """All texts in the code that finds mistakes."""
+    """All string literals in the code that reports errors."""
     files = (PAGE.parents[1] / "lsmgeo" / "diagnosis").glob("*.py")
     trees = [ast.parse(file.read_text(encoding="utf-8")) for file in files]
     nodes = [node for tree in trees for node in ast.walk(tree)]
     return {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
 
 
-def test_the_page_has_the_names_that_are_given():
+def test_the_page_has_the_names_that_are_reported():
     text = PAGE.read_text(encoding="utf-8")
     titles = set(re.findall(r"\n([^\n]+)\n~{3,}\n", text)) - {"Calibrations and voxels"}
     assert set(OF_CAMERAS) < titles
@@ -80,7 +80,7 @@ def test_the_page_has_the_names_that_are_given():
 
 
 @pytest.mark.parametrize("name", OF_CAMERAS)
-def test_the_cure_undoes_the_mistake(name):
+def test_the_correction_fixes_the_error(name):
     expected = right_cameras()
     names = {
         "torch": torch,
@@ -94,17 +94,17 @@ def test_the_cure_undoes_the_mistake(name):
     assert not torch.equal(names["views"].cam_from_world, expected.cam_from_world) or not torch.equal(
         names["views"].intrinsics, expected.intrinsics
     )
-    exec(compile(cures()[name], f"{PAGE}: {name}", "exec"), names)
+    exec(compile(corrections()[name], f"{PAGE}: {name}", "exec"), names)
     for found, right in zip(names["views"], expected, strict=True):
         torch.testing.assert_close(torch.as_tensor(found), torch.as_tensor(right).expand(torch.as_tensor(found).shape))
 
 
-def test_the_way_along_the_ray_becomes_depth():
+def test_distance_along_the_ray_becomes_depth():
     views = right_cameras()
     rows, columns = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
     pixels = torch.stack((columns, rows, torch.ones_like(rows)), -1).double()
     rays = torch.linalg.solve(views.intrinsics[:, None, None], pixels[..., None])[..., 0]  # z is 1
     expected = torch.full((3, HEIGHT, WIDTH), 1.7, dtype=torch.float64)
     names = {"cameras": cameras, "views": views, "depth": expected * rays.norm(dim=-1)}
-    exec(compile(cures()["depth along the ray"], str(PAGE), "exec"), names)
+    exec(compile(corrections()["depth along the ray"], str(PAGE), "exec"), names)
     torch.testing.assert_close(names["depth"], expected)

@@ -83,16 +83,16 @@ def kernel(scene: Scene) -> dict[str, Callable[[], Any]]:
         raise LeftOut("not one call of a kernel")
     reduce, is_sweep = problem.statistic or None, problem.is_sweep
     options = Options.checked("benchmark", "trilinear" if is_sweep else "bilinear", mode_of(scene), reduce=reduce)
-    options = options._replace(stacked=problem.flatten)
+    options = options._replace(flatten=problem.flatten)
     if reason := library.why_not("plane_sweep_project" if is_sweep else "unproject", source, options):
         raise LeftOut(reason)
     if is_sweep:
         where = scene.cameras, scene.grid, scene.depths, (problem.size,) * 2
         sites = sweep_sites("benchmark", source, *where, None, options)
-        forward, backward, axis = library.volume, library.volume_backward, 1
+        forward, backward, axis = library.plane_sweep_project, library.plane_sweep_project_backward, 1
     else:
         sites = image_sites("benchmark", source, scene.cameras, scene.grid, None, options)
-        forward, backward, axis = library.images, library.images_backward, 2
+        forward, backward, axis = library.unproject, library.unproject_backward, 2
     out, _ = forward(source, sites, options)
     gradient = scene.cotangent(out)
     into = channels_last(torch.zeros(source.shape), axis)
@@ -112,8 +112,8 @@ def floors(count: int) -> dict[str, Callable[[], Any]]:
     faults.
     """
     shape = (count // 4,)
-    buffer = library.fresh(shape, torch.float32)
-    return {COLD: lambda: library.fresh(shape, torch.float32).fill_(1.0), WARM: lambda: buffer.fill_(1.0)}
+    buffer = library.empty(shape, torch.float32)
+    return {COLD: lambda: library.empty(shape, torch.float32).fill_(1.0), WARM: lambda: buffer.fill_(1.0)}
 
 
 CONTENDERS: Mapping[str, Callable[[Scene], Run]] = {

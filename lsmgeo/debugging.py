@@ -8,6 +8,8 @@ from contextvars import ContextVar
 
 import torch
 
+from lsmgeo._torch_compat import has_function_transforms
+
 __all__ = ["can_inspect", "debug"]
 
 PLAIN = (torch.Tensor, torch.nn.Parameter)
@@ -38,7 +40,7 @@ def debug() -> Iterator[None]:
 
 def is_traced() -> bool:
     """Whether the running code is being traced or transformed, so that no value may steer it."""
-    return torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
+    return torch.compiler.is_compiling() or has_function_transforms()
 
 
 def can_inspect(*tensors: torch.Tensor) -> bool:

@@ -17,7 +17,6 @@ from lsmgeo import kernels
 from lsmgeo._checks import (
     check_choices,
     check_devices,
-    check_flag,
     check_float,
     check_geometry,
     check_mask,
@@ -117,10 +116,18 @@ def unproject(
         tensor([2.3889, 2.6429])
     """
     who = "Unproject"
-    options = Options.checked(who, "bilinear", mode, padding_mode, augment, direction_frame, reduce, near)
-    kernels.check_backend(who, backend)
-    sites = image_sites(who, features, cameras, grid, view_mask, options)
-    return Unprojected(*kernels.run("unproject", features, sites, options=options, backend=backend))
+    options = kernels.check_options(
+        who, "bilinear", backend, mode, padding_mode, augment, direction_frame, reduce, near
+    )
+    return run_unproject(features, cameras, grid, view_mask, options)
+
+
+def run_unproject(
+    features: Tensor, cameras: Cameras, grid: Grid, view_mask: Tensor | None, options: Options
+) -> Unprojected:
+    """`unproject` with options that are checked already."""
+    sites = image_sites("Unproject", features, cameras, grid, view_mask, options)
+    return Unprojected(*kernels.run("unproject", features, sites, options=options))
 
 
 def unproject_slabs(
@@ -171,14 +178,15 @@ def unproject_slabs(
     """
     who = "unproject_slabs"
     check_whole(who, "planes", planes, 1)
-    options = Options.checked(who, "bilinear", mode, padding_mode, augment, direction_frame, reduce, near)
-    kernels.check_backend(who, backend)
+    options = kernels.check_options(
+        who, "bilinear", backend, mode, padding_mode, augment, direction_frame, reduce, near
+    )
     sites = image_sites(who, features, cameras, grid, view_mask, options)
 
     def slabs() -> Iterator[tuple[int, Tensor, Tensor]]:
         for start in range(0, sites.z.shape[-1], planes):
             part = sites.slab(start, start + planes)
-            yield start, *kernels.run("unproject", features, part, options=options, backend=backend)
+            yield start, *kernels.run("unproject", features, part, options=options)
 
     return slabs()
 
@@ -229,8 +237,9 @@ def unproject_points(
         tensor([[[[2.]]]])
     """
     who = "unproject_points"
-    options = Options.checked(who, "bilinear", mode, padding_mode, augment, direction_frame, reduce, near)
-    kernels.check_backend(who, backend)
+    options = kernels.check_options(
+        who, "bilinear", backend, mode, padding_mode, augment, direction_frame, reduce, near
+    )
     matrices = image_matrices(who, features, cameras, view_mask)
     check_geometry(who, "points", points, "(B, N, 3)", rank=3)
     if points.shape[0] != features.shape[0] or points.shape[2] != 3:
@@ -243,7 +252,7 @@ def unproject_points(
         world = torch.eye(4, dtype=torch.float64, device=features.device)
         direction = direction_matrix(matrices, world, options.direction)
     arguments = (matrices.projection(), direction, points, view_mask)
-    return Unprojected(*kernels.run("unproject_points", features, *arguments, options=options, backend=backend))
+    return Unprojected(*kernels.run("unproject_points", features, *arguments, options=options))
 
 
 def sample_views(
@@ -289,10 +298,9 @@ def sample_views(
         tensor([[[[1.2500, 3.5000]]]])
     """
     who = "sample_views"
-    options = Options.checked(who, "bilinear", mode, padding_mode, augment, reduce=reduce, near=near)
+    options = kernels.check_options(who, "bilinear", backend, mode, padding_mode, augment, reduce=reduce, near=near)
     if options.direction:
         raise OptionError(f"{who}: augment must be 'depth' or nothing, a direction needs a camera; got {augment!r}")
-    kernels.check_backend(who, backend)
     views = check_features(who, features)
     check_geometry(who, "pixels", pixels, "(B, V, N, 2)", rank=4)
     if tuple(pixels.shape[:2]) != views or pixels.shape[3] != 2:
@@ -307,7 +315,7 @@ def sample_views(
         if not bool((finite | ~valid).all()):
             raise GridError(f"{who}: pixels and depth must be finite where valid")
     arguments = (pixels, depth, valid)
-    return Unprojected(*kernels.run("sample_views", features, *arguments, options=options, backend=backend))
+    return Unprojected(*kernels.run("sample_views", features, *arguments, options=options))
 
 
 def plane_sweep_project(
@@ -368,15 +376,24 @@ def plane_sweep_project(
         >>> maps[0, 0, :, 1, 1]  # the camera looks along -x from x = 2
         tensor([ 0.2500,  0.0000, -0.2500])
     """
-    who = "PlaneSweepProject"
-    options = Options.checked(
-        who, "trilinear", mode, padding_mode, augment, direction_frame, near=near, stacked=flatten
-    )
-    kernels.check_backend(who, backend)
-    check_flag(who, "flatten", flatten)
-    sites = sweep_sites(who, volume, cameras, grid, depths, size, view_mask, options)
-    maps, visible = kernels.run("plane_sweep_project", volume, sites, options=options, backend=backend)
-    return Projected(maps.flatten(2, 3) if flatten else maps, visible)
+    choices = mode, padding_mode, augment, direction_frame
+    options = kernels.check_options("PlaneSweepProject", "trilinear", backend, *choices, near=near, flatten=flatten)
+    return run_plane_sweep_project(volume, cameras, grid, depths, size, view_mask, options)
+
+
+def run_plane_sweep_project(
+    volume: Tensor,
+    cameras: Cameras,
+    grid: VoxelGrid,
+    depths: Tensor,
+    size: tuple[int, int] | None,
+    view_mask: Tensor | None,
+    options: Options,
+) -> Projected:
+    """`plane_sweep_project` with options that are checked already."""
+    sites = sweep_sites("PlaneSweepProject", volume, cameras, grid, depths, size, view_mask, options)
+    maps, visible = kernels.run("plane_sweep_project", volume, sites, options=options)
+    return Projected(maps.flatten(2, 3) if options.flatten else maps, visible)
 
 
 def view_statistics(volume: Tensor, visible: Tensor, statistics: Names, view_mask: Tensor | None = None) -> Tensor:

@@ -26,6 +26,7 @@ from lsmgeo._checks import (
     moved,
 )
 from lsmgeo._linalg import affine_inverse, basis_row, homogeneous_row, inverse_3x3, multiply
+from lsmgeo._torch_compat import is_exporting
 from lsmgeo.cameras.matrices import camera_matrices
 from lsmgeo.cameras.tensors import Cameras, as_tensors, check_cameras, common_size
 from lsmgeo.debugging import can_inspect
@@ -362,8 +363,7 @@ def depth_planes(near: float | Tensor, far: float | Tensor, num: int, spacing: s
     else:
         planes = torch.exp((1.0 - a) * torch.log(first) + a * torch.log(last))
     planes = torch.cat((ends[0], planes[..., 1:-1].to(dtype), ends[1]), -1)  # the ends exactly
-    # Programs that a graph is exported to, ONNX among them, cannot look at bits. (Older PyTorch does not tell.)
-    is_exporting = getattr(torch.compiler, "is_exporting", torch.compiler.is_compiling)
+    # Programs that a graph is exported to, ONNX among them, cannot look at bits.
     if torch.jit.is_tracing() or is_exporting():  # type: ignore[attr-defined]
         return planes
     # Rounding may leave neighbours equal. Positive numbers are ordered as the integers of the same bits.

@@ -2,20 +2,50 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from torch import Tensor, nn
 
 from lsmgeo import functional, kernels
-from lsmgeo._checks import check_flag, check_size, describe, moved
+from lsmgeo._checks import check_size, describe, moved
 from lsmgeo._sites import Cameras, Grid
 from lsmgeo.errors import DTypeError, GridError
 from lsmgeo.functional import Names, Projected, Unprojected
 from lsmgeo.grids import FrustumGrid, VoxelGrid, check_constant_depths
-from lsmgeo.kernels.request import Options
 
 __all__ = ["PlaneSweepProject", "Unproject"]
 
 
-class Unproject(nn.Module):
+def _as_given(name: str) -> Any:
+    """An option of a layer as it was given; it cannot be set."""
+    return property(lambda self: self.given[name])
+
+
+class SamplingLayer(nn.Module):
+    """A layer whose options are checked once, at construction.
+
+    Attributes:
+        options: the checked options, which `forward` hands down.
+        given: the options as given, by name.
+    """
+
+    mode = _as_given("mode")
+    padding_mode = _as_given("padding_mode")
+    augment = _as_given("augment")
+    direction_frame = _as_given("direction_frame")
+    near = _as_given("near")
+    backend = _as_given("backend")
+
+    def __init__(self, who: str, smooth: str, *, backend: str, **given: Any) -> None:
+        super().__init__()
+        self.options = kernels.check_options(who, smooth, backend, **given)
+        self.given = {**given, "backend": backend}
+
+    def _options_repr(self) -> str:
+        return ", ".join(f"{name}={value!r}" for name, value in self.given.items())
+
+
+class Unproject(SamplingLayer):
     """Lift image features to the sites of a grid; see `lsmgeo.functional.unproject` for equation and conventions.
 
     Args:
@@ -46,6 +76,8 @@ class Unproject(nn.Module):
         ((1, 3, 9, 8, 8, 8), (1, 3, 8, 8, 8))
     """
 
+    reduce = _as_given("reduce")
+
     def __init__(
         self,
         grid: Grid | None = None,
@@ -58,19 +90,20 @@ class Unproject(nn.Module):
         near: float = 1e-6,
         backend: str = "auto",
     ) -> None:
-        super().__init__()
         if grid is not None and not isinstance(grid, (VoxelGrid, FrustumGrid)):
             raise DTypeError(f"Unproject: grid must be a VoxelGrid or a FrustumGrid; got {describe(grid)}")
-        kernels.check_backend("Unproject", backend)
-        Options.checked("Unproject", "bilinear", mode, padding_mode, augment, direction_frame, reduce, near)
+        super().__init__(
+            "Unproject",
+            "bilinear",
+            mode=mode,
+            padding_mode=padding_mode,
+            augment=augment,
+            direction_frame=direction_frame,
+            reduce=reduce,
+            near=near,
+            backend=backend,
+        )
         self.grid = grid
-        self.mode = mode
-        self.padding_mode = padding_mode
-        self.augment = augment
-        self.direction_frame = direction_frame
-        self.reduce = reduce
-        self.near = near
-        self.backend = backend
 
     def forward(
         self, features: Tensor, cameras: Cameras, view_mask: Tensor | None = None, *, grid: Grid | None = None
@@ -79,30 +112,14 @@ class Unproject(nn.Module):
         grid = self.grid if grid is None else grid
         if grid is None:
             raise GridError("Unproject: grid must be given to the layer or to the call; got None")
-        return functional.unproject(
-            features,
-            cameras,
-            grid,
-            view_mask=view_mask,
-            mode=self.mode,
-            padding_mode=self.padding_mode,
-            augment=self.augment,
-            direction_frame=self.direction_frame,
-            reduce=self.reduce,
-            near=self.near,
-            backend=self.backend,
-        )
+        return functional.run_unproject(features, cameras, grid, view_mask, self.options)
 
     def extra_repr(self) -> str:
         """The arguments."""
-        return (
-            f"{self.grid}, mode={self.mode!r}, padding_mode={self.padding_mode!r}, augment={self.augment!r}, "
-            f"direction_frame={self.direction_frame!r}, reduce={self.reduce!r}, near={self.near!r}, "
-            f"backend={self.backend!r}"
-        )
+        return f"{self.grid}, {self._options_repr()}"
 
 
-class PlaneSweepProject(nn.Module):
+class PlaneSweepProject(SamplingLayer):
     """Read a volume along the rays of cameras at planes of depth; see `lsmgeo.functional.plane_sweep_project`.
 
     Args:
@@ -136,6 +153,8 @@ class PlaneSweepProject(nn.Module):
         ((1, 3, 30, 12, 16), (1, 3, 6, 12, 16))
     """
 
+    flatten = _as_given("flatten")
+
     def __init__(
         self,
         grid: VoxelGrid | None = None,
@@ -150,7 +169,6 @@ class PlaneSweepProject(nn.Module):
         near: float = 1e-6,
         backend: str = "auto",
     ) -> None:
-        super().__init__()
         who = "PlaneSweepProject"
         if grid is not None and not isinstance(grid, VoxelGrid):
             raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
@@ -158,19 +176,20 @@ class PlaneSweepProject(nn.Module):
             check_constant_depths(who, depths)
         if size is not None:
             check_size(who, "size", size, 2, "(h, w)")
-        check_flag(who, "flatten", flatten)
-        kernels.check_backend(who, backend)
-        Options.checked(who, "trilinear", mode, padding_mode, augment, direction_frame, near=near)
+        super().__init__(
+            who,
+            "trilinear",
+            mode=mode,
+            padding_mode=padding_mode,
+            augment=augment,
+            direction_frame=direction_frame,
+            flatten=flatten,
+            near=near,
+            backend=backend,
+        )
         self.grid = grid
         self.depths = depths
         self.size = size
-        self.mode = mode
-        self.padding_mode = padding_mode
-        self.augment = augment
-        self.direction_frame = direction_frame
-        self.flatten = flatten
-        self.near = near
-        self.backend = backend
 
     def forward(
         self,
@@ -191,27 +210,10 @@ class PlaneSweepProject(nn.Module):
             depths = moved("PlaneSweepProject", "depths", self.depths, device)
         if depths is None:
             raise GridError("PlaneSweepProject: depths must be given to the layer or to the call; got None")
-        return functional.plane_sweep_project(
-            volume,
-            cameras,
-            grid,
-            depths,
-            self.size if size is None else size,
-            view_mask=view_mask,
-            mode=self.mode,
-            padding_mode=self.padding_mode,
-            augment=self.augment,
-            direction_frame=self.direction_frame,
-            flatten=self.flatten,
-            near=self.near,
-            backend=self.backend,
-        )
+        size = self.size if size is None else size
+        return functional.run_plane_sweep_project(volume, cameras, grid, depths, size, view_mask, self.options)
 
     def extra_repr(self) -> str:
         """The arguments."""
         depths = None if self.depths is None else f"<{tuple(self.depths.shape)} {self.depths.dtype}>"
-        return (
-            f"{self.grid}, depths={depths}, size={self.size}, mode={self.mode!r}, padding_mode={self.padding_mode!r}, "
-            f"augment={self.augment!r}, direction_frame={self.direction_frame!r}, flatten={self.flatten}, "
-            f"near={self.near!r}, backend={self.backend!r}"
-        )
+        return f"{self.grid}, depths={depths}, size={self.size}, {self._options_repr()}"

@@ -31,6 +31,7 @@ from lsmgeo.functional import Names, Projected
 from lsmgeo.grids import VoxelGrid, check_constant_depths
 from lsmgeo.kernels.request import Options
 from lsmgeo.kernels.view_statistics import first_maximum
+from lsmgeo.layers import SamplingLayer
 
 __all__ = ["Composited", "ProjectReduce", "composite", "expected_depth", "max_along_rays", "project_reduce"]
 
@@ -253,14 +254,29 @@ def project_reduce(
         tensor([3., 3.])
     """
     who = "project_reduce"
-    options = Options.checked(who, "trilinear", mode, padding_mode, augment, direction_frame, near=near)
-    kernels.check_backend(who, backend)
+    options = kernels.check_options(who, "trilinear", backend, mode, padding_mode, augment, direction_frame, near=near)
+    return _project_reduce(volume, cameras, grid, depths, weight, bias, size, view_mask, options)
+
+
+def _project_reduce(
+    volume: Tensor,
+    cameras: Cameras,
+    grid: VoxelGrid,
+    depths: Tensor,
+    weight: Tensor,
+    bias: Tensor | None,
+    size: tuple[int, int] | None,
+    view_mask: Tensor | None,
+    options: Options,
+) -> Projected:
+    """`project_reduce` with options that are checked already."""
+    who = "project_reduce"
     sites = sweep_sites(who, volume, cameras, grid, depths, size, view_mask, options)
     check_float(who, "weight", weight, "(O, C' P)")
     if weight.dim() == 4 and tuple(weight.shape[2:]) == (1, 1):
         weight = weight.flatten(1)
     planes = depths.shape[-1]
-    channels = volume.shape[1] + bool(options.depth) + 3 * bool(options.direction)
+    channels = volume.shape[1] + options.appended()
     if weight.dim() != 2 or weight.shape[1] != channels * planes:
         raise ShapeError(
             f"{who}: weight must be (O, C' P) or (O, C' P, 1, 1) with C' P = {channels} * {planes}; "
@@ -272,10 +288,10 @@ def project_reduce(
             raise ShapeError(f"{who}: bias must be (O,) = ({weight.shape[0]},); got {tuple(bias.shape)}")
     check_devices(who, volume=volume, weight=weight, bias=bias)
     stacked = weight.unflatten(1, (channels, planes))
-    return Projected(*kernels.run("project_reduce", volume, sites, stacked, bias, options=options, backend=backend))
+    return Projected(*kernels.run("project_reduce", volume, sites, stacked, bias, options=options))
 
 
-class ProjectReduce(nn.Module):
+class ProjectReduce(SamplingLayer):
     """`project_reduce` with learned weights: a plane sweep and a 1x1 convolution over its C' P channels in one.
 
     Args:
@@ -326,10 +342,17 @@ class ProjectReduce(nn.Module):
         near: float = 1e-6,
         backend: str = "auto",
     ) -> None:
-        super().__init__()
         who = "ProjectReduce"
-        options = Options.checked(who, "trilinear", mode, padding_mode, augment, direction_frame, near=near)
-        kernels.check_backend(who, backend)
+        super().__init__(
+            who,
+            "trilinear",
+            mode=mode,
+            padding_mode=padding_mode,
+            augment=augment,
+            direction_frame=direction_frame,
+            near=near,
+            backend=backend,
+        )
         for name, value in (("in_channels", in_channels), ("out_channels", out_channels)):
             check_whole(who, name, value, 1)
         if not isinstance(grid, VoxelGrid):
@@ -341,13 +364,7 @@ class ProjectReduce(nn.Module):
         self.grid = grid
         self.depths = depths
         self.size = size
-        self.mode = mode
-        self.padding_mode = padding_mode
-        self.augment = augment
-        self.direction_frame = direction_frame
-        self.near = near
-        self.backend = backend
-        channels = in_channels + bool(options.depth) + 3 * bool(options.direction)
+        channels = in_channels + self.options.appended()
         if channels * depths.shape[-1] * out_channels > LARGEST_COUNT:
             raise OptionError(
                 f"{who}: in_channels times planes times out_channels must be 2^31 - 1 at most; "
@@ -368,28 +385,14 @@ class ProjectReduce(nn.Module):
         """Sweep and reduce a volume (B, C, D, H, W); `size` takes the place of the layer's."""
         device = volume.device if isinstance(volume, Tensor) else self.depths.device
         depths = moved("ProjectReduce", "depths", self.depths, device)
-        return project_reduce(
-            volume,
-            cameras,
-            self.grid,
-            depths,
-            self.weight,
-            self.bias,
-            self.size if size is None else size,
-            view_mask=view_mask,
-            mode=self.mode,
-            padding_mode=self.padding_mode,
-            augment=self.augment,
-            direction_frame=self.direction_frame,
-            near=self.near,
-            backend=self.backend,
+        size = self.size if size is None else size
+        return _project_reduce(
+            volume, cameras, self.grid, depths, self.weight, self.bias, size, view_mask, self.options
         )
 
     def extra_repr(self) -> str:
         """The arguments."""
         return (
             f"{self.weight.shape[1] // self.depths.shape[-1]} channels x {self.depths.shape[-1]} planes -> "
-            f"{self.weight.shape[0]}, {self.grid}, size={self.size}, mode={self.mode!r}, "
-            f"padding_mode={self.padding_mode!r}, augment={self.augment!r}, direction_frame={self.direction_frame!r}, "
-            f"near={self.near!r}, backend={self.backend!r}"
+            f"{self.weight.shape[0]}, {self.grid}, size={self.size}, {self._options_repr()}"
         )

@@ -1,7 +1,7 @@
 """Kernels: resampling between a lattice and an array through a matrix. They know neither cameras nor grids.
 
-This module is the one place where a backend is chosen. A backend owns a predicate that says why it cannot run a call;
-"auto" takes the first of `BACKENDS` that can, a backend asked for by name runs or raises with its reason.
+This module is the one place where a backend is chosen. A backend has a predicate that says why it cannot run a call;
+"auto" takes the first of `BACKENDS` that can; a backend requested by name runs, or raises with its reason.
 """
 
 from __future__ import annotations
@@ -18,7 +18,18 @@ from lsmgeo.errors import BackendError
 from lsmgeo.kernels import reference, torch_ops
 from lsmgeo.kernels.request import OPERATORS, Options, Sites
 
-__all__ = ["BACKENDS", "OPERATORS", "Backend", "Options", "Sites", "check_backend", "explain", "run", "select"]
+__all__ = [
+    "BACKENDS",
+    "OPERATORS",
+    "Backend",
+    "Options",
+    "Sites",
+    "check_backend",
+    "check_options",
+    "explain",
+    "run",
+    "select",
+]
 
 
 @dataclass(frozen=True)
@@ -26,7 +37,7 @@ class Backend:
     """A set of kernels.
 
     Args:
-        name: what a user asks for.
+        name: as in the argument `backend`.
         why_not: from (operator, source, options) to the reason why this backend cannot run it, or None.
         operators: the kernels by operator name.
     """
@@ -48,44 +59,49 @@ def check_backend(who: str, name: object) -> str:
     return check_choice(who, "backend", name, ("auto", *(backend.name for backend in BACKENDS)))
 
 
-def select(operator: str, source: Tensor, options: Options, backend: str = "auto") -> Backend:
+def check_options(who: str, smooth: str, backend: object, *choices: Any, **more: Any) -> Options:
+    """`Options.checked`, with the name of a backend."""
+    return Options.checked(who, smooth, *choices, **more).on(check_backend(who, backend))
+
+
+def select(operator: str, source: Tensor, options: Options) -> Backend:
     """The backend that runs this call."""
     reasons = []
     for candidate in BACKENDS:
-        if backend in ("auto", candidate.name):
+        if options.backend in ("auto", candidate.name):
             reason = candidate.why_not(operator, source, options)
             if reason is None:
                 return candidate
             reasons.append(f"{candidate.name}: {reason}")
-    raise BackendError(f"{operator}: backend {backend!r} cannot run this call ({'; '.join(reasons)})")
+    raise BackendError(f"{operator}: backend {options.backend!r} cannot run this call ({'; '.join(reasons)})")
 
 
-def run(operator: str, source: Tensor, *args: Any, options: Options, backend: str = "auto") -> Any:
+def run(operator: str, source: Tensor, *arguments: Any, options: Options) -> Any:
     """Run an operator on the backend that `select` names."""
-    backend_operator = select(operator, source, options, backend).operators[operator]
-    return backend_operator(source, *_differentiable(operator, args, options), options)
+    backend = select(operator, source, options)
+    return backend.operators[operator](source, *_differentiable(operator, arguments, options), options)
 
 
-def _differentiable(operator: str, args: tuple[Any, ...], options: Options) -> tuple[Any, ...]:
-    """The arguments, without the derivatives that no answer has: the nearest cell has none by the geometry."""
-    nearest, appended = options.mode == "nearest", options.depth or bool(options.direction)
+def _differentiable(operator: str, arguments: tuple[Any, ...], options: Options) -> tuple[Any, ...]:
+    """The arguments, detached where the answer has no derivative: the nearest cell has none by the geometry."""
+    nearest, appended = options.mode == "nearest", options.appended() > 0
     if operator == "sample_views":
-        pixels, depth, valid = args
+        pixels, depth, valid = arguments
         return pixels.detach() if nearest else pixels, depth if options.depth else depth.detach(), valid
     if not nearest:
-        return args
+        return arguments
     if operator == "unproject_points":
-        matrix, direction, points, view_mask = args
+        matrix, direction, points, view_mask = arguments
         matrix, points = matrix if options.depth else matrix.detach(), points if appended else points.detach()
         return matrix, direction, points, view_mask
-    sites, *others = args
+    sites, *others = arguments
     # The depth of an image's site comes from its matrix, that of a plane from the table of depths.
     matrix = sites.matrix if options.depth and operator == "unproject" else sites.matrix.detach()
-    return sites.placed(matrix, sites.direction, sites.z if appended else sites.z.detach()), *others
+    return sites.with_geometry(matrix, sites.direction, sites.z if appended else sites.z.detach()), *others
 
 
 def explain(operator: str, source: Tensor, **options: Any) -> str:
-    """Tell for each backend whether "auto" would take it for a call, and why not; also prints it.
+    """Print and return, for each backend, whether "auto" would take it for a call, or why not.
 
     Args:
         operator: "unproject", "unproject_points", "sample_views", "plane_sweep_project" or "project_reduce".
@@ -93,10 +109,10 @@ def explain(operator: str, source: Tensor, **options: Any) -> str:
         **options: options of the call: mode, padding_mode, augment, direction_frame, reduce, near.
 
     Returns:
-        One line a backend.
+        A line for the call, then one for each backend.
 
     Raises:
-        OptionError: an unknown operator or option value.
+        OptionError: an unknown operator or an invalid option.
 
     Example:
         >>> import torch

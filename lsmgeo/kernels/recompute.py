@@ -10,8 +10,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
+from lsmgeo._torch_compat import has_forward_derivatives
 from lsmgeo.debugging import is_traced
 
 __all__ = ["recomputed"]
@@ -50,6 +50,6 @@ def recomputed(function: Piece, *inputs: Tensor | None) -> tuple[Tensor, Tensor]
     Every tensor that needs a gradient must be among the inputs. Differentiable twice. Under tracing a plain call.
     """
     needed = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
-    if is_traced() or forward_ad._current_level >= 0 or not needed:  # forward-mode derivatives want every step
+    if is_traced() or has_forward_derivatives() or not needed:  # forward-mode derivatives want every step
         return function(*inputs)
     return _Recomputed.apply(function, *inputs)

@@ -15,151 +15,33 @@ from torch.nn.functional import grid_sample
 
 from lsmgeo._dtypes import computing_dtype, saturating_cast
 from lsmgeo.debugging import is_traced
+from lsmgeo.kernels.lattice_geometry import (
+    LARGEST_COORDINATE,
+    OUTSIDE,
+    lattice_directions,
+    lattice_extent,
+    lattice_rows,
+    mask_views,
+    per_view,
+    perspective_division,
+    plane_rows,
+    point_directions,
+    point_extent,
+    point_rows,
+    recenter,
+    recentered_matrix,
+    scale_below_overflow,
+)
 from lsmgeo.kernels.recompute import recomputed
 from lsmgeo.kernels.request import Options, Sites
 from lsmgeo.kernels.view_statistics import view_statistics
 
 __all__ = ["OPERATORS", "why_not"]
 
-# Sites are sent here to read nothing: every tap is outside the array, for any interpolation.
-OUTSIDE = -2.0
-# Homogeneous coordinates are kept below 2^100, and a site counts as in front only beyond 2^-60, so that neither the
-# quotient's derivative nor anything before it overflows in float32.
-LARGEST_COORDINATE = 2.0**100
-SMALLEST_DEPTH = 2.0**-60
-
 
 def why_not(operator: str, source: Tensor, options: Options) -> str | None:
     """The reference runs everything."""
     return None
-
-
-# Geometry
-
-
-def _lattice_rows(matrix: Tensor, sites: Sites, dtype: torch.dtype) -> list[Tensor]:
-    """The three coordinates of ``M q``, each (B, V, D, H, W).
-
-    A lattice is separable: the terms in x and y are summed over a plane, those in z along a line, and the full array is
-    one sum of the two.
-    """
-    m = matrix.to(dtype)
-    line = m[..., 2, None] * _per_view(sites.z, matrix).to(dtype)[:, :, None]  # (B, V, 3, D)
-    plane = _plane_rows(m, sites)  # (B, V, 3, H, W)
-    return [plane[:, :, row, None] + line[:, :, row, :, None, None] for row in range(3)]
-
-
-def _plane_rows(m: Tensor, sites: Sites) -> Tensor:
-    """The terms of ``M q`` in x, y and 1, (B, V, 3, H, W)."""
-    x, y = sites.x.to(m.dtype), sites.y.to(m.dtype)
-    return m[..., 0, None, None] * x + (m[..., 1, None, None] * y[:, None] + m[..., 3, None, None])
-
-
-def _point_rows(matrix: Tensor, points: Tensor, dtype: torch.dtype) -> list[Tensor]:
-    """The three coordinates of ``M (X, 1)`` for points (B, N, 3), each (B, V, N)."""
-    m = matrix.to(dtype)
-    x, y, z = (axis[:, None] for axis in points.to(dtype).unbind(-1))  # (B, 1, N)
-    return [
-        m[..., row, 0, None] * x + m[..., row, 1, None] * y + m[..., row, 2, None] * z + m[..., row, 3, None]
-        for row in range(3)
-    ]
-
-
-def _per_view(z: Tensor, matrix: Tensor) -> Tensor:
-    """(D,), (B, D) or (B, V, D) -> (B, V, D)."""
-    if z.dim() == 2:
-        z = z[:, None]
-    return z.expand(*matrix.shape[:2], z.shape[-1])
-
-
-def _extent(matrix: Tensor, reach: Sequence[Tensor]) -> Tensor:
-    """A bound on the terms of ``M q``, (B, V, ...), for M (B, V, ..., 3, 4) and bounds on |x|, |y| and |z|."""
-    m = matrix.detach().abs().amax(-2)  # (B, V, ..., 4)
-    return m[..., 0] * reach[0] + m[..., 1] * reach[1] + m[..., 2] * reach[2] + m[..., 3]
-
-
-def _lattice_extent(matrix: Tensor, sites: Sites) -> Tensor:
-    z = _per_view(sites.z.detach(), matrix).abs().amax(-1)
-    return _extent(matrix, (sites.x.abs().amax(0), sites.y.abs().amax(0), z))
-
-
-def _point_extent(matrix: Tensor, points: Tensor) -> Tensor:
-    reach = points.detach().double().abs().sum(1)  # (B, 3); the sum, unlike the maximum, exists for no points
-    return _extent(matrix, reach[:, None].unbind(-1))
-
-
-def _scale_below_overflow(extent: Tensor) -> Tensor:
-    """A factor 2^-k that brings `extent` to `LARGEST_COORDINATE` at most, 1 where it is small already."""
-    return torch.exp2(-torch.log2(extent.clamp_min(LARGEST_COORDINATE) / LARGEST_COORDINATE).ceil())
-
-
-def _unit(rows: Sequence[Tensor], terms: Tensor, view_mask: Tensor | None) -> Tensor:
-    """Normalise the vector (B, V, *sites) x 3 to (B, V, 3, *sites); 0 with zero gradient at 0.
-
-    `terms` broadcasts to (B, V, *sites): a bound on the terms whose sum the vector is. A vector as short as their
-    rounding error has no direction: the site is the camera centre.
-    """
-    vector = torch.stack(list(rows), 2)
-    squares = vector.square().sum(2, keepdim=True)
-    away = squares > (4.0 * torch.finfo(vector.dtype).eps * terms.to(vector.dtype)).square()[:, :, None]
-    unit = torch.where(away, vector * torch.where(away, squares, 1.0).rsqrt(), 0.0)
-    return _masked(unit, view_mask)
-
-
-def _lattice_directions(sites: Sites, dtype: torch.dtype) -> Tensor:
-    assert sites.direction is not None
-    matrix = sites.direction / _power_of_two(sites.direction.detach().abs().amax((-1, -2)))[..., None, None]
-    # Bounded plane by plane, so that the planes of a slab come out as those of the whole.
-    z = _per_view(sites.z.detach(), matrix).abs()
-    terms = _extent(matrix[:, :, None], (sites.x.abs().amax(0), sites.y.abs().amax(0), z))[..., None, None]
-    return _unit(_lattice_rows(matrix, sites, dtype), terms, sites.view_mask)
-
-
-def _point_directions(
-    direction: Tensor, points: Tensor, part: slice, view_mask: Tensor | None, dtype: torch.dtype
-) -> Tensor:
-    largest = direction.detach().abs().amax((-1, -2))
-    scale = _power_of_two(torch.maximum(_point_extent(direction, points), largest / LARGEST_COORDINATE))
-    matrix = direction / scale[..., None, None]
-    reach = [axis[:, None] for axis in points[:, part].detach().abs().unbind(-1)]  # (B, 1, N)
-    return _unit(_point_rows(matrix, points[:, part], dtype), _extent(matrix[:, :, None], reach), view_mask)
-
-
-def _nearby(points: Tensor) -> tuple[Tensor, Tensor]:
-    """A point amid those of each scene, (B, 3) float64, and the points as seen from there.
-
-    Applied to coordinates of a distant origin, float32 loses pixels; a matrix composed in float64 takes the origin in.
-    The point lies on a coarse lattice, so that no digit of a coordinate is lost, and is the origin where that is near.
-    """
-    double = points.double()
-    known = double.detach()
-    count = max(1, points.shape[1]) if isinstance(points.shape[1], int) else points.shape[1]
-    mean = known.sum(1) / count
-    spread = torch.cat((torch.zeros_like(mean[:, None]), (known - mean[:, None]).abs()), 1).amax((1, 2))[:, None]
-    step = _power_of_two(spread)
-    near = torch.where(spread > 0, torch.round(mean / step) * step, mean)
-    return near, double - near[:, None]
-
-
-def _moved(matrix: Tensor, near: Tensor) -> Tensor:
-    """The matrix (B, V, 3, 4) that acts on points as seen from `near` (B, 3)."""
-    shift = (matrix[..., :3] * near[:, None, None]).sum(-1, keepdim=True)
-    return torch.cat((matrix[..., :3], matrix[..., 3:] + shift), -1)
-
-
-def _power_of_two(value: Tensor) -> Tensor:
-    """The power of two at or above a number, 1 for 0: a scale that rounds nothing."""
-    return torch.exp2(torch.log2(torch.where(value > 0, value, 1.0)).ceil())
-
-
-def _masked(values: Tensor, view_mask: Tensor | None) -> Tensor:
-    """(B, V, ...) with the left-out views at 0."""
-    return values if view_mask is None else torch.where(_aligned(view_mask, values.dim()), values, 0.0)
-
-
-def _aligned(per_view: Tensor, dim: int) -> Tensor:
-    """(B, V) -> (B, V, 1, ...) of `dim` axes."""
-    return per_view.reshape(*per_view.shape, *(1,) * (dim - 2))
 
 
 # Sampling
@@ -245,22 +127,9 @@ def _sample_through_cameras(
     Returns:
         Values (B, V, C, *sites), visibility, and depth or None.
     """
-    index, front = _divide(rows, unit, view_mask, options)
+    index, front = perspective_division(rows, unit, view_mask, options)
     values, visible = _sample(source, index, front, options)
-    return values, visible, _masked(rows[2] / unit, view_mask) if options.depth else None
-
-
-def _divide(
-    rows: Sequence[Tensor], unit: Tensor, view_mask: Tensor | None, options: Options
-) -> tuple[list[Tensor], Tensor]:
-    """From homogeneous pixels to pixels x and y, `OUTSIDE` for sites not in front; and which are in front."""
-    x, y, z = rows
-    threshold = (options.near * unit).clamp_min(SMALLEST_DEPTH)
-    if view_mask is not None:
-        threshold = torch.where(_aligned(view_mask, z.dim()), threshold, torch.inf)
-    front = z > threshold
-    inverse = torch.where(front, z, 1.0).reciprocal()
-    return [torch.where(front, axis * inverse, OUTSIDE) for axis in (x, y)], front
+    return values, visible, mask_views(rows[2] / unit, view_mask) if options.depth else None
 
 
 def _over_pieces(
@@ -301,17 +170,17 @@ def unproject(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, T
     """
     dtype, output = computing_dtype(source), source.dtype
     source = source.to(dtype)
-    scale = _scale_below_overflow(_lattice_extent(sites.matrix, sites))[..., None]  # (B, V, 1)
+    scale = scale_below_overflow(lattice_extent(sites.matrix, sites))[..., None]  # (B, V, 1)
 
     def piece(
         start: int, stop: int, source: Tensor, matrix: Tensor, direction: Tensor | None, z: Tensor
     ) -> tuple[Tensor, Tensor]:
         matrix = matrix * scale[..., None]  # homogeneous: a factor moves no pixel
-        part = sites.placed(matrix, direction, z[..., start:stop])
-        unit = (_per_view(part.z, matrix) * scale if part.projective else scale).to(dtype)[..., None, None]
-        rows = _lattice_rows(matrix, part, dtype)
+        part = sites.with_geometry(matrix, direction, z[..., start:stop])
+        unit = (per_view(part.z, matrix) * scale if part.projective else scale).to(dtype)[..., None, None]
+        rows = lattice_rows(matrix, part, dtype)
         values, visible, depth = _sample_through_cameras(source, rows, unit, part.view_mask, options)
-        vectors = _lattice_directions(part, dtype) if options.direction else None
+        vectors = lattice_directions(part, dtype) if options.direction else None
         return _output(values, depth, vectors, dtype if options.reduce else output), visible
 
     total, inputs = sites.z.shape[-1], (source, sites.matrix, sites.direction, sites.z)
@@ -328,19 +197,19 @@ def unproject_points(
     """
     dtype, output = computing_dtype(source), source.dtype
     source = source.to(dtype)
-    near, points = _nearby(points)
-    matrix = _moved(matrix, near)
-    direction = None if direction is None else _moved(direction, near)
-    scale = _scale_below_overflow(_point_extent(matrix, points))[..., None]  # (B, V, 1)
+    origin, points = recenter(points)
+    matrix = recentered_matrix(matrix, origin)
+    direction = None if direction is None else recentered_matrix(direction, origin)
+    scale = scale_below_overflow(point_extent(matrix, points))[..., None]  # (B, V, 1)
 
     def piece(
         start: int, stop: int, source: Tensor, matrix: Tensor, direction: Tensor | None, points: Tensor
     ) -> tuple[Tensor, Tensor]:
-        rows = _point_rows(matrix * scale[..., None], points[:, start:stop], dtype)
+        rows = point_rows(matrix * scale[..., None], points[:, start:stop], dtype)
         values, visible, depth = _sample_through_cameras(source, rows, scale.to(dtype), view_mask, options)
         vectors = None
         if direction is not None:
-            vectors = _point_directions(direction, points, slice(start, stop), view_mask, dtype)
+            vectors = point_directions(direction, points, slice(start, stop), view_mask, dtype)
         return _output(values, depth, vectors, dtype if options.reduce else output), visible
 
     total, inputs = points.shape[1], (source, matrix, direction, points)
@@ -371,23 +240,48 @@ def sample_views(
     return _over_pieces(piece, total, inputs, options, output) if options.reduce else piece(0, total, *inputs)
 
 
+def sample_pixels(
+    source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options
+) -> tuple[Tensor, Tensor]:
+    """What the fused kernels do with pixels, in the reference's operations: the second derivatives come from here.
+
+    Args:
+        source: (B, V, C, h, w).
+        pixels: (B, V, N, 2).
+        front: (B, V, N) bool; nothing is read elsewhere.
+        extra: (B, V, E, N), channels to append, or None.
+        options: mode, padding_mode and reduce.
+
+    Returns:
+        (B, V, C + E, N), or (B, C'', N) where options.reduce is set, and visibility (B, V, N).
+    """
+    dtype = computing_dtype(source)
+    index = [torch.where(front, axis, OUTSIDE) for axis in pixels.to(dtype).unbind(-1)]
+    values, visible = _sample(source.to(dtype), index, front, options)
+    if extra is not None:
+        values = torch.cat((values, extra.to(dtype)), 2)
+    if options.reduce:
+        values = view_statistics(values, visible, options.reduce)
+    return saturating_cast(values, source.dtype), visible
+
+
 def _sweep(source: Tensor, sites: Sites, options: Options, output: torch.dtype) -> tuple[Tensor, Tensor]:
     dtype = source.dtype
     m = sites.matrix.to(dtype)
-    depth = (1.0 / _per_view(sites.z, sites.matrix)).to(dtype)  # (B, V, P)
+    depth = (1.0 / per_view(sites.z, sites.matrix)).to(dtype)  # (B, V, P)
     front = depth > options.near
     if sites.view_mask is not None:
         front = front & sites.view_mask[..., None]
     # M q / s = depth (M_x x + M_y y + M_1) + M_z. Planes to leave out are sent outside along the line, at no cost.
-    plane = _plane_rows(m, sites).clamp(-LARGEST_COORDINATE, LARGEST_COORDINATE)
+    plane = plane_rows(m, sites).clamp(-LARGEST_COORDINATE, LARGEST_COORDINATE)
     reach = torch.where(front, depth, 0.0)[..., None, None]
     offset = torch.where(front[:, :, None], m[..., 2, None], OUTSIDE)[..., None, None]  # (B, V, 3, P, 1, 1)
     index = [torch.addcmul(offset[:, :, row], plane[:, :, row, None], reach) for row in range(3)]
     views = source[:, None].expand(source.shape[0], sites.matrix.shape[1], *source.shape[1:])
     values, visible = _sample(views, index, front[..., None, None], options)
-    sizes = visible.shape[3:]
-    channel = _masked(depth, sites.view_mask)[..., None, None].expand(*depth.shape, *sizes) if options.depth else None
-    return _output(values, channel, _lattice_directions(sites, dtype) if options.direction else None, output), visible
+    channel = mask_views(depth, sites.view_mask)[..., None, None].expand(*depth.shape, *visible.shape[3:])
+    directions = lattice_directions(sites, dtype) if options.direction else None
+    return _output(values, channel if options.depth else None, directions, output), visible
 
 
 def plane_sweep_project(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
@@ -422,7 +316,7 @@ def project_reduce(
     def piece(
         start: int, stop: int, volume: Tensor, matrix: Tensor, direction: Tensor | None, z: Tensor, weight: Tensor
     ) -> tuple[Tensor, Tensor]:
-        part = sites.placed(matrix, direction, z[..., start:stop])
+        part = sites.with_geometry(matrix, direction, z[..., start:stop])
         maps, visible = _sweep(volume, part, options, dtype)
         stacked = maps.flatten(2, 3).flatten(3, 4)  # (B, V, C' p, h w)
         with torch.autocast(maps.device.type, enabled=False):

@@ -1,4 +1,4 @@
-"""What a kernel is asked to do: sites, and options."""
+"""What a kernel computes: at which sites, and with which options."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from lsmgeo._checks import check_choice, check_choices, check_number, describe
+from lsmgeo._checks import check_choice, check_choices, check_flag, check_number, describe
 from lsmgeo.errors import OptionError
 
 __all__ = ["OPERATORS", "Options", "Sites"]
@@ -19,17 +19,17 @@ STATISTICS = ("mean", "variance", "max")
 class Sites(NamedTuple):
     """The sites of a lattice as V views of B scenes see them, in float64.
 
-    Site (k, j, i) has ``q = (x[i], y[j], z[k], 1)`` and ``s = z[k]`` if `projective` else 1. Its place in the source
-    array is ``M q``: divided by its third coordinate if the source is an image, by s if it is a volume.
+    Site (k, j, i) has ``q = (x[i], y[j], z[k], 1)`` and ``s = z[k]`` if `projective` else 1. Its index in the source
+    array is ``M q``, divided by its third coordinate if the source is an image, by s if it is a volume.
 
     Attributes:
         matrix: M, (B, V, 3, 4): source index from lattice index.
-        direction: G, (B, V, 3, 4), whose ``G q`` points from the camera centre to the site; None if not asked for.
+        direction: G, (B, V, 3, 4): ``G q`` points from the camera centre to the site; None without ray directions.
         x: (W,).
         y: (H,).
         z: (D,), (B, D) or (B, V, D).
         projective: whether s is the third coordinate of q.
-        view_mask: (B, V) bool, False for views to leave out; None keeps all.
+        view_mask: (B, V) bool, False for views that are left out; None keeps all.
     """
 
     matrix: Tensor
@@ -42,23 +42,40 @@ class Sites(NamedTuple):
 
     def slab(self, start: int, stop: int) -> Sites:
         """The sites of planes start to stop."""
-        return self.placed(self.matrix, self.direction, self.z[..., start:stop])
+        return self.with_geometry(self.matrix, self.direction, self.z[..., start:stop])
 
-    def placed(self, matrix: Tensor, direction: Tensor | None, z: Tensor) -> Sites:
+    def with_geometry(self, matrix: Tensor, direction: Tensor | None, z: Tensor) -> Sites:
         """The sites with other matrices and planes. PyTorch 2.7 does not compile `_replace`."""
         return Sites(matrix, direction, self.x, self.y, z, self.projective, self.view_mask)
 
+    def counts(self) -> tuple[int, int, int]:
+        """(D, H, W)."""
+        return self.z.shape[-1], self.y.shape[0], self.x.shape[0]
+
 
 class Options(NamedTuple):
-    """How to sample, what to append and whether to reduce over views; see `lsmgeo.functional.unproject`."""
+    """How to sample, what to append and whether to reduce over views; see `lsmgeo.functional.unproject`.
+
+    Checked once, by `checked`; everything below the public functions takes this one value.
+    """
 
     mode: str
     padding_mode: str = "zeros"
-    depth: bool = False
-    direction: str = ""  # "", or the frame of the directions to append
+    depth: bool = False  # whether to append the depth
+    direction: str = ""  # the frame of the ray directions to append, or ""
     reduce: tuple[str, ...] = ()
     near: float = 1e-6
-    stacked: bool = False  # whether planes will be stacked with the channels: a fused kernel lays them out for it
+    flatten: bool = False  # whether planes are then stacked with the channels: fused kernels lay memory out for it
+    backend: str = "auto"
+
+    def appended(self) -> int:
+        """The number of geometric channels that a lattice's sites append."""
+        return int(self.depth) + 3 * bool(self.direction)
+
+    def on(self, backend: str) -> Options:
+        """The options with this backend. PyTorch 2.7 does not compile `_replace`."""
+        fields = self.mode, self.padding_mode, self.depth, self.direction, self.reduce, self.near, self.flatten
+        return Options(*fields, backend)
 
     @classmethod
     def checked(
@@ -71,9 +88,9 @@ class Options(NamedTuple):
         direction_frame: Any = "world",
         reduce: Any = None,
         near: Any = 1e-6,
-        stacked: bool = False,
+        flatten: Any = False,
     ) -> Options:
-        """Options from a user's arguments (`smooth` or "nearest" is the mode); an `OptionError` names a wrong one."""
+        """Options from a user's arguments, the mode `smooth` or "nearest"; an `OptionError` names an invalid one."""
         mode = check_choice(who, "mode", smooth if mode is None else mode, (smooth, "nearest"))
         check_choice(who, "padding_mode", padding_mode, PADDING_MODES)
         extra = check_choices(who, "augment", augment, ("depth", "direction"))
@@ -82,6 +99,6 @@ class Options(NamedTuple):
         if reduce is not None and not statistics:
             raise OptionError(f"{who}: reduce must be None or name a statistic; got {describe(reduce)}")
         distance = check_number(who, "near", near, "a finite number, at least 0", 0)
-        return cls(
-            mode, padding_mode, "depth" in extra, frame if "direction" in extra else "", statistics, distance, stacked
-        )
+        check_flag(who, "flatten", flatten)
+        direction = frame if "direction" in extra else ""
+        return cls(mode, padding_mode, "depth" in extra, direction, statistics, distance, flatten)

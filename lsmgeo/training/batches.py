@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils._pytree import tree_map
 from torch.utils.data import DataLoader, Dataset
 
+from lsmgeo._torch_compat import tree_map
 from lsmgeo.data import Batch, EpochSampler, ShapeDataset, ShardSet, collate
 from lsmgeo.data.shards.shape_sets import ShapeSet, SyntheticSet, render_batch, synthetic_numbers
 from lsmgeo.data.shards.shape_transforms import TransformedShapes

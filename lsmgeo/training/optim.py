@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import distributed, nn
 
+from lsmgeo._torch_compat import multiply_all
 from lsmgeo.data import Batch
 from lsmgeo.errors import TrainingError
 from lsmgeo.models.losses import sum_loss
@@ -200,7 +201,7 @@ def move_parameters(
     factor = found.factor * (1.0 if clip is None or found.norm <= clip else clip / found.norm)
     groups = optimiser.param_groups
     gradients = [parameter.grad for group in groups for parameter in group["params"] if parameter.grad is not None]
-    torch._foreach_mul_(gradients, factor)
+    multiply_all(gradients, factor)
     for group in groups:
         group["lr"] = rate
     if accelerator.scaler is None:

@@ -176,15 +176,15 @@ def test_the_same_bits_from_run_to_run(operator, threads):
 def test_memory_that_is_given_is_written_to():
     options = Options.checked("test", "bilinear")
     sites = image_sites("test", cases.WIDE, cases.VIEWS, cases.GRID, None, options)
-    expected, _ = library.images(cases.WIDE, sites, options)
+    expected, _ = library.unproject(cases.WIDE, sites, options)
     out = torch.full(expected.shape, torch.nan)  # contiguous, unlike what the kernel would make
-    found, _ = library.images(cases.WIDE, sites, options, out)
+    found, _ = library.unproject(cases.WIDE, sites, options, out)
     assert found is out
     torch.testing.assert_close(out, expected, rtol=0, atol=0)
     needs = (True, False, False, False)
-    gradient, *_ = library.images_backward(expected, cases.WIDE, sites, options, needs)
+    gradient, *_ = library.unproject_backward(expected, cases.WIDE, sites, options, needs)
     into = torch.ones_like(gradient)
-    library.images_backward(expected, cases.WIDE, sites, options, needs, into)
+    library.unproject_backward(expected, cases.WIDE, sites, options, needs, into)
     torch.testing.assert_close(into, gradient + 1.0)
 
 
@@ -192,9 +192,9 @@ def test_half_volumes_swept_into_float32():
     options = Options.checked("test", "trilinear")
     volume = cases.VOLUME.bfloat16()
     sites = sweep_sites("test", volume, cases.VIEWS, cases.GRID, cases.DEPTHS, cases.SIZE, None, options)
-    expected, _ = library.volume(volume.float(), sites, options)
+    expected, _ = library.plane_sweep_project(volume.float(), sites, options)
     out = torch.empty(expected.shape)
-    library.volume(volume, sites, options, out)
+    library.plane_sweep_project(volume, sites, options, out)
     torch.testing.assert_close(out, expected, rtol=1e-6, atol=1e-6)
 
 
@@ -203,15 +203,15 @@ def test_half_volumes_swept_into_float32():
 
 # opcheck looks at the gradients of tensors that have none.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-@pytest.mark.parametrize("operator", ["images", "pixels", "volume", "project_reduce"])
+@pytest.mark.parametrize("operator", ["unproject", "sample_views", "plane_sweep_project", "project_reduce"])
 def test_opcheck(operator):
     options = Options.checked(
-        "test", "trilinear" if operator in ("volume", "project_reduce") else "bilinear", augment="depth"
-    )
-    leaf = (cases.FEATURES if operator in ("images", "pixels") else cases.VOLUME).clone().requires_grad_()
-    if operator == "pixels":
+        "test", "trilinear" if operator in ("plane_sweep_project", "project_reduce") else "bilinear", augment="depth"
+    ).on("cpu")
+    leaf = (cases.FEATURES if operator in ("unproject", "sample_views") else cases.VOLUME).clone().requires_grad_()
+    if operator == "sample_views":
         arguments = (leaf, cases.PIXELS.clone().requires_grad_(), cases.VALID, cases.DISTANCE[:, :, None])
-    elif operator == "images":
+    elif operator == "unproject":
         arguments = (leaf, *image_sites("test", leaf, cases.VIEWS, cases.GRID, cases.MASK, options))
     else:
         arguments = (
@@ -220,11 +220,11 @@ def test_opcheck(operator):
         )
         if operator == "project_reduce":
             planes = cases.DEPTHS.shape[0]
-            arguments = (*arguments, torch.rand(3, cases.C + 1, planes, requires_grad=True), None)
+            arguments = (leaf, torch.rand(3, cases.C + 1, planes, requires_grad=True), None, *arguments[1:])
     # A gradient of the weights is a sum over all pixels, which a product of matrices may add up in another order.
     terms = cases.B * cases.V * cases.SIZE[0] * cases.SIZE[1]
     tolerance = {"rtol": terms * UNIT_ROUNDOFF[torch.float32], "atol": 1e-5} if operator == "project_reduce" else {}
-    torch.library.opcheck(getattr(torch.ops.lsmgeo, operator).default, (*arguments, *options, "cpu"), **tolerance)
+    torch.library.opcheck(getattr(torch.ops.lsmgeo, operator).default, (*arguments, *options), **tolerance)
 
 
 def test_second_derivatives_are_those_of_the_reference():
@@ -383,7 +383,7 @@ def test_it_can_be_turned_off():
     code = (
         "import torch; from lsmgeo import kernels;"
         "kernels.explain('unproject', torch.zeros(1, 2, 3, 4, 5));"
-        "print(kernels.native.library.fresh((2, 3), torch.float32).shape)"
+        "print(kernels.native.library.empty((2, 3), torch.float32).shape)"
     )
     text = _child(code, LSMGEO_NATIVE="0")
     assert "cpu: turned off by LSMGEO_NATIVE=0" in text

@@ -109,7 +109,7 @@ MORE = {
     "maximum": images(Options("nearest", reduce=("max",))),
     "everything": images(Options("bilinear", reduce=EVERY, **AUGMENTED)),
     "everything, half": images(Options("bilinear", "border", reduce=EVERY, **AUGMENTED), torch.float16),
-    "stacked": volume(Options("trilinear", stacked=True)),
+    "stacked": volume(Options("trilinear", flatten=True)),
     "volume with channels": volume(Options("trilinear", **AUGMENTED), torch.float16),
     "nearest cell": volume(Options("nearest", "border", depth=True), torch.bfloat16),
     "pixels reduced": Variant(FEATURES.half(), POINTS, Options("bilinear", "border", reduce=EVERY)),

@@ -170,7 +170,7 @@ def the_largest_of_minus_infinity() -> None:
     """An unseen view does not stand for it, and what no view sees stays 0."""
     source, sites = torch.full_like(features(2), -torch.inf), image_sites(7, mask=True)
     options = Options("nearest", reduce=("max",))
-    found, visible = operators.images(source, sites, options)
+    found, visible = operators.unproject(source, sites, options)
     expected = torch.where(visible.any(1), -torch.inf, 0.0)[:, None].expand_as(found)
     assert bool(visible.any(1).any())
     assert not bool(visible.any(1).all())
@@ -215,17 +215,17 @@ def nan_reaches_its_footprint_alone() -> None:
         Options("bilinear", reduce=EVERY),
     ):
         values, visible = reference.unproject(source, sites, options)
-        found, seen = operators.images(source, sites, options)
+        found, seen = operators.unproject(source, sites, options)
         assert bool(values.isnan().any())
         assert not bool(values.isnan().all())
         torch.testing.assert_close(found, values, rtol=1e-4, atol=1e-4, equal_nan=True)
         torch.testing.assert_close(seen, visible, rtol=0, atol=0)
         clean = torch.ones_like(values)
         clean[0] = 0.0  # no gradient comes from where the NaN are
-        assert_finite(*operators.images_backward(clean, source, sites, options, (True, False, False, False)))
+        assert_finite(*operators.unproject_backward(clean, source, sites, options, (True, False, False, False)))
         if "variance" not in options.reduce:  # finite gradients do not meet the features
             expected = by_reference(reference.unproject, source, sites, options, torch.ones_like(values))[2][0]
-            gradient, *_ = operators.images_backward(
+            gradient, *_ = operators.unproject_backward(
                 torch.ones_like(values), source, sites, options, (True, False, False, False)
             )
             torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-4)
@@ -284,7 +284,7 @@ def whole_indices_belong_to_the_cell_above() -> None:
     halves = sites._replace(matrix=matrix + torch.tensor([0.0, 0.0, 0.0, 0.5])[:, None].mT * matrix[..., 2:, 3:])
     options = Options("nearest")
     expected, visible = reference.unproject(features(2), halves, options)
-    found, seen = operators.images(features(2), halves, options)
+    found, seen = operators.unproject(features(2), halves, options)
     torch.testing.assert_close(found, expected, rtol=0, atol=0)
     torch.testing.assert_close(seen, visible, rtol=0, atol=0)
 
@@ -319,10 +319,10 @@ def nothing_gives_nothing() -> None:
 def only_what_is_needed() -> None:
     sites, source = image_sites(14, batch=1, views=2), features(2, batch=1, views=2)
     cotangent = torch.randn(1, 2, 6, *SHAPE, generator=generator(9))
-    everything = operators.images_backward(cotangent, source, sites, AUGMENTED, (True,) * 4)
+    everything = operators.unproject_backward(cotangent, source, sites, AUGMENTED, (True,) * 4)
     for index in range(4):
         needs = tuple(index == other for other in range(4))
-        found = operators.images_backward(cotangent, source, sites, AUGMENTED, needs)
+        found = operators.unproject_backward(cotangent, source, sites, AUGMENTED, needs)
         assert [gradient is not None for gradient in found] == list(needs)
         torch.testing.assert_close(found[index], everything[index], rtol=1e-6, atol=1e-6)
 
@@ -334,7 +334,7 @@ def only_what_is_needed() -> None:
 def volumes_in_many_tiles() -> None:
     sites = sweep_sites(4, batch=1, views=1, shape=(3, 2, 5))
     for stacked in (False, True):
-        options = Options("trilinear", depth=True, direction="world", stacked=stacked)
+        options = Options("trilinear", depth=True, direction="world", flatten=stacked)
         with patched(**SMALL_TILES):
             given = torch.randn(1, 1, 2, 5, 9, 3, generator=generator(2))
             given = given.permute(0, 1, 4, 5, 2, 3) if stacked else given.permute(0, 1, 4, 5, 2, 3).contiguous()
@@ -355,7 +355,7 @@ def volumes_written_where_told() -> None:
         assert values is out
     half, maps = volumes(dtype=torch.float16), torch.zeros(B, 2, 4, *SHAPE)
     expected, _ = reference.plane_sweep_project(half.float(), sites, options)
-    operators.volume(half, sites, options, out=maps)
+    operators.plane_sweep_project(half, sites, options, out=maps)
     torch.testing.assert_close(maps, expected, rtol=1e-5, atol=1e-5)
 
 
@@ -363,11 +363,13 @@ def volumes_written_where_told() -> None:
 def volumes_gradients_are_added() -> None:
     sites, options = sweep_sites(6), Options("trilinear")
     cotangent = torch.randn(B, 2, 3, *SHAPE, generator=generator(5))
-    expected, *_ = operators.volume_backward(cotangent, volumes(), sites, options, (True, False, False, False))
+    expected, *_ = operators.plane_sweep_project_backward(
+        cotangent, volumes(), sites, options, (True, False, False, False)
+    )
     for mode in (contextlib.nullcontext, deterministic):
         into = torch.ones(3, *CELLS, B).movedim(-1, 0)
         with mode():
-            found, *_ = operators.volume_backward(
+            found, *_ = operators.plane_sweep_project_backward(
                 cotangent, volumes(), sites, options, (True, False, False, False), into
             )
         assert found is into
@@ -419,9 +421,9 @@ def deterministic_sums() -> None:
         shape = (B, count, *SHAPE) if options.reduce else (B, V, count, *SHAPE)
         cotangent = 1e-9 * torch.randn(shape, generator=generator(2))
         needs = (True, True, True, True)
-        expected = operators.images_backward(cotangent, features(), sites, options, needs)
+        expected = operators.unproject_backward(cotangent, features(), sites, options, needs)
         with deterministic():
-            found = [operators.images_backward(cotangent, features(), sites, options, needs) for _ in range(2)]
+            found = [operators.unproject_backward(cotangent, features(), sites, options, needs) for _ in range(2)]
         for first, second, other in zip(*found, expected, strict=True):
             torch.testing.assert_close(first, second, rtol=0, atol=0)
             torch.testing.assert_close(first, other, rtol=0, atol=1e-6 * float(other.abs().max()))

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lsmgeo._dtypes import computing_dtype, saturating_cast
 from lsmgeo.kernels import reference
+from lsmgeo.kernels.lattice_geometry import per_view
 from lsmgeo.kernels.request import Options, Sites
 from lsmgeo.kernels.triton import operators
 from lsmgeo.kernels.view_statistics import view_statistics
@@ -141,7 +142,7 @@ def points(seed: int = 3, extras: int = 2, count: int = 11) -> Points:
 
 
 def sample_pixels(source: Tensor, given: Points, options: Options) -> tuple[Tensor, Tensor]:
-    """What `operators.pixels` means, by the reference's parts."""
+    """What `operators.sample_views` means, by the reference's parts."""
     dtype, output = computing_dtype(source), source.dtype
     index = [torch.where(given.front, axis, -2.0) for axis in given.pixels.to(dtype).unbind(-1)]
     values, visible = reference._sample(source.to(dtype), index, given.front, options)
@@ -161,7 +162,7 @@ def by_reference(
     if isinstance(place, Sites):
         M, G = place.matrix.clone().requires_grad_(), place.direction
         G = None if G is None else G.clone().requires_grad_()
-        z = reference._per_view(place.z, place.matrix).clone().requires_grad_()
+        z = per_view(place.z, place.matrix).clone().requires_grad_()
         leaves, place = (M, G, z), place._replace(matrix=M, direction=G, z=z)
     else:
         leaves = tuple(leaf if leaf is None else leaf.clone().requires_grad_() for leaf in (place.pixels, place.extra))
@@ -185,13 +186,17 @@ def by_kernels(
     """The kernels' answer and gradients; the cotangent is the answer itself if None."""
     needs = (True,) * 4
     if not isinstance(place, Sites):
-        values, visible = operators.pixels(source, *place, options)
-        back = operators.pixels_backward(values if cotangent is None else cotangent, source, *place, options, needs[:3])
+        values, visible = operators.sample_views(source, *place, options)
+        back = operators.sample_views_backward(
+            values if cotangent is None else cotangent, source, *place, options, needs[:3]
+        )
         return values, visible, list(back)
     values, visible = (
-        operators.volume(source, place, options, out) if volume else operators.images(source, place, options)
+        operators.plane_sweep_project(source, place, options, out)
+        if volume
+        else operators.unproject(source, place, options)
     )
-    backward = operators.volume_backward if volume else operators.images_backward
+    backward = operators.plane_sweep_project_backward if volume else operators.unproject_backward
     return values, visible, list(backward(values if cotangent is None else cotangent, source, place, options, needs))
 
 
@@ -219,7 +224,7 @@ def compare(
     operator: Any = reference.plane_sweep_project if volume else reference.unproject
     if not isinstance(place, Sites):
         operator = sample_pixels
-    plain = options._replace(stacked=False)
+    plain = options._replace(flatten=False)
     with torch.no_grad():
         shape = operator(source, place, plain)[0].shape
     if cotangent is None:

@@ -9,7 +9,7 @@ from lsmgeo import functional, grids, rays
 from lsmgeo._linalg import transform
 from lsmgeo._sites import direction_matrix
 from lsmgeo.cameras import matrices, projection
-from lsmgeo.kernels import reference, request
+from lsmgeo.kernels import lattice_geometry, reference, request
 from lsmgeo.kernels import view_statistics as statistics
 from tests.mutants import patching
 from tests.mutants.patching import (
@@ -91,7 +91,7 @@ def _divided(is_front, divisor):
         front = is_front(z, call.near * unit)
         if mask is not None:
             front = front & mask.reshape(*mask.shape, *(1,) * (z.dim() - 2))
-        index = [torch.where(front, axis / divisor(z), reference.OUTSIDE) for axis in (x, y)]
+        index = [torch.where(front, axis / divisor(z), lattice_geometry.OUTSIDE) for axis in (x, y)]
         values, visible = reference._sample(source, index, front, call)
         return values, visible, inner(source, homogeneous, unit, mask, call)[2]
 
@@ -125,7 +125,7 @@ def _output(change):
 
 
 def _unit(change):
-    return around(reference._unit, change)
+    return around(lattice_geometry.unit_vectors, change)
 
 
 def _voxel_lattice(change):
@@ -308,7 +308,9 @@ FAULTS = {
         )
     ),
     "geometric channels only where visible": outcome(("unproject", "unproject_points"), _hidden_augmentation),
-    "direction not normalised": _unit(lambda inner, vector, *a: reference._masked(torch.stack(list(vector), 2), *a)),
+    "direction not normalised": _unit(
+        lambda inner, vector, *a: lattice_geometry.mask_views(torch.stack(list(vector), 2), *a)
+    ),
     "direction towards the camera": _unit(lambda inner, *a: -inner(*a)),
     "direction in z, y, x order": _unit(lambda inner, *a: inner(*a).flip(2)),
     "direction frames exchanged": around(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 import sys
 from collections.abc import Callable, Iterator
@@ -104,7 +103,7 @@ def options(names: tuple[str, ...], **changes: Any) -> Patch:
     """Run the operators with other options."""
 
     def wrapper(inner: Any, *args: Any) -> Any:
-        return inner(*args[:-1], dataclasses.replace(args[-1], **changes))
+        return inner(*args[:-1], args[-1]._replace(**changes))
 
     return lambda: _operators(names, wrapper)
 

@@ -21,22 +21,23 @@ MODULES = {
 }
 
 # Layers of the core, lowest first; a layer's modules import those named, and no others of the library.
-SHARED = {"errors", "_checks", "_dtypes", "_linalg", "_old_names", "debugging"}
+SHARED = {"errors", "_checks", "_dtypes", "_linalg", "_old_names", "_torch_compat", "debugging"}
 MAY_IMPORT = {
     "errors": set(),
     "_checks": {"errors"},
     "_dtypes": set(),
     "_linalg": set(),
     "_old_names": set(),
-    "debugging": set(),
+    "_torch_compat": set(),
+    "debugging": {"_torch_compat"},
     "cameras": SHARED | {"cameras"},
     "grids": SHARED | {"cameras"},
-    "kernels": {"errors", "_checks", "_dtypes", "debugging", "kernels"},
+    "kernels": {"errors", "_checks", "_dtypes", "_torch_compat", "debugging", "kernels"},
     "_sites": SHARED | {"cameras", "grids", "kernels"},
     "functional": SHARED | {"cameras", "grids", "kernels", "_sites"},
     "layers": SHARED | {"functional", "grids", "kernels", "_sites"},
     "fusion": SHARED | {"functional", "kernels"},
-    "rays": SHARED | {"functional", "grids", "kernels", "_sites"},
+    "rays": SHARED | {"functional", "layers", "grids", "kernels", "_sites"},
 }
 # What the parts outside may import of each other; the core is open to all of them.
 MAY_ALSO_IMPORT = {
@@ -198,6 +199,53 @@ def test_one_module_knows_grid_sample():
         module for module, path in MODULES.items() if names_in(path) & {"grid_sample", "affine_grid", "align_corners"}
     }
     assert knowing == {"lsmgeo.kernels.reference"}
+
+
+# Attributes of public objects that only PyTorch should know.
+PRIVATE_ATTRIBUTES = {"_dynamo_marked_constant"}
+
+
+def private_names_of_pytorch(source: str) -> set[str]:
+    """Private names of PyTorch that a source imports, or reads as attributes of what it imports from PyTorch."""
+    tree, found, roots = ast.parse(source), set(), {"torch"}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        theirs = [name for name in names if name.split(".")[0] == "torch"]
+        found |= {name for name in theirs if any(part.startswith("_") for part in name.split("."))}
+        if theirs:
+            roots |= {alias.asname or alias.name.split(".")[0] for alias in node.names}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.startswith("__"):
+            root = node.value
+            while isinstance(root, ast.Attribute):
+                root = root.value
+            if node.attr in PRIVATE_ATTRIBUTES or (isinstance(root, ast.Name) and root.id in roots):
+                found.add(ast.unparse(node))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("import torch\nx = torch._C._get_tracing_state()", {"torch._C._get_tracing_state", "torch._C"}),
+        ("from torch.autograd import forward_ad as ad\nx = ad._current_level", {"ad._current_level"}),
+        ("from torch.utils._pytree import tree_map", {"torch.utils._pytree.tree_map"}),
+        ("f._dynamo_marked_constant = True", {"f._dynamo_marked_constant"}),
+        ("import torch\nx = torch.__version__, torch.zeros(1)._ours", set()),
+    ],
+)
+def test_private_names_of_pytorch_are_noticed(source, found):
+    assert private_names_of_pytorch(source) == found
+
+
+def test_private_names_of_pytorch_are_in_one_file():
+    found = {module for module, path in MODULES.items() if private_names_of_pytorch(path.read_text(encoding="utf-8"))}
+    assert found == {"lsmgeo._torch_compat"}
 
 
 def test_only_cameras_know_the_camera_classes_of_kornia():

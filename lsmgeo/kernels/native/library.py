@@ -17,17 +17,18 @@ import torch
 from torch import Tensor
 
 from lsmgeo._dtypes import saturating_cast
+from lsmgeo._torch_compat import as_constant
 from lsmgeo.kernels.request import Options, Sites
 
 __all__ = [
-    "fresh",
-    "images",
-    "images_backward",
+    "empty",
     "instruction_set",
-    "pixels",
-    "pixels_backward",
-    "volume",
-    "volume_backward",
+    "plane_sweep_project",
+    "plane_sweep_project_backward",
+    "sample_views",
+    "sample_views_backward",
+    "unproject",
+    "unproject_backward",
     "why_not",
 ]
 
@@ -115,15 +116,11 @@ def why_not(operator: str, source: Tensor, options: Options) -> str | None:
     return _missing()
 
 
+@as_constant
 def _missing() -> str | None:
     """Why there is no library, or None."""
     library = _library()
     return library if isinstance(library, str) else None
-
-
-# torch.compile takes the answer as a constant instead of looking into the loading of a file. What
-# `torch.compiler.assume_constant_result` does beyond this is to import dynamo.
-_missing._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def instruction_set(name: str | None = None) -> str:
@@ -137,7 +134,7 @@ def instruction_set(name: str | None = None) -> str:
     return found.decode()
 
 
-def fresh(shape: Sequence[int], dtype: torch.dtype, order: Sequence[int] | None = None) -> Tensor:
+def empty(shape: Sequence[int], dtype: torch.dtype, order: Sequence[int] | None = None) -> Tensor:
     """Memory for an output of this shape; `order` names its axes from the slowest to the fastest.
 
     Large outputs are put in huge pages: touching fresh pages of 4 KiB costs as much as the kernels do.
@@ -220,7 +217,7 @@ def _source_gradient(call: _Call, source: Tensor, axis: int, into: Tensor | None
     """Where the source's gradient goes, in float32: `into`, to be added to, or fresh memory that the kernel clears."""
     if into is None:
         order = [other for other in range(source.dim()) if other != axis]
-        gradient = fresh(source.shape, torch.float32, [*order, axis])
+        gradient = empty(source.shape, torch.float32, [*order, axis])
         if 0 in call.sites[:]:  # then no task runs that would clear it
             gradient.zero_()
     elif into.shape[axis] > 1 and into.stride(axis) != 1:
@@ -290,8 +287,8 @@ def _sample(
     channels = (call.channels + call.depth + 3 * call.direction + call.extra) * max(1, len(options.reduce))
     views = () if reduced else (call.views,)
     if out is None:
-        order = (0, 2, 3, 4, 1) if reduced else (0, 1, 4, 5, 2, 3) if options.stacked else (0, 1, 3, 4, 5, 2)
-        out = fresh((call.scenes, *views, channels, *counts), dtype, order)
+        order = (0, 2, 3, 4, 1) if reduced else (0, 1, 4, 5, 2, 3) if options.flatten else (0, 1, 3, 4, 5, 2)
+        out = empty((call.scenes, *views, channels, *counts), dtype, order)
     visible = torch.empty((call.scenes, call.views, *counts), dtype=torch.bool, device="cpu")
     call.values, call.values_type, call.visible = out.data_ptr(), TYPES[out.dtype], visible.data_ptr()
     call.values_stride[:] = _six(out, options)
@@ -306,12 +303,12 @@ def _six(values: Tensor, options: Options) -> tuple[int, ...]:
     return (strides[0], 0, *strides[1:]) if options.reduce else strides
 
 
-def images(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """`reference.unproject`; `out` is memory of the answer's shape to write to."""
+def unproject(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """As `reference.unproject`; `out` is memory of the answer's shape to write to."""
     return _sample(*_lattice(IMAGES, source, sites, options), source.dtype, options, out)
 
 
-def images_backward(
+def unproject_backward(
     gradient: Tensor,
     source: Tensor,
     sites: Sites,
@@ -319,13 +316,13 @@ def images_backward(
     needs: Sequence[bool],
     into: Tensor | None = None,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """Vector-Jacobian product of `images` to source, matrix, direction and z.
+    """Vector-Jacobian product of `unproject` to source, matrix, direction and z.
 
     Args:
         gradient: of the values, any strides.
-        source: as for `images`.
-        sites: as for `images`.
-        options: as for `images`.
+        source: as for `unproject`.
+        sites: as for `unproject`.
+        options: as for `unproject`.
         needs: which of the four are asked for.
         into: float32 memory of the source's shape, channels next to one another, to add its gradient to.
 
@@ -336,7 +333,7 @@ def images_backward(
     return _lattice_backward(IMAGES, gradient, source, sites, options, needs, into)
 
 
-def pixels(
+def sample_views(
     source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options
 ) -> tuple[Tensor, Tensor]:
     """Sample images (B, V, C, h, w) at pixels (B, V, N, 2) where `front` (B, V, N), append `extra` (B, V, E, N)."""
@@ -357,7 +354,7 @@ def _pixel_call(
     return call, (pixels, front, extras)
 
 
-def pixels_backward(
+def sample_views_backward(
     gradient: Tensor,
     source: Tensor,
     pixels: Tensor,
@@ -366,7 +363,7 @@ def pixels_backward(
     options: Options,
     needs: Sequence[bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    """Vector-Jacobian product of `pixels` to source, pixels and extra, each in its dtype."""
+    """Vector-Jacobian product of `sample_views` to source, pixels and extra, each in its dtype."""
     original, source = source, _channels_last(source, 2)
     call, kept = _pixel_call(source, pixels, front, extra, options)
     _gradient(call, gradient[..., None, None, :], options)
@@ -386,12 +383,14 @@ def pixels_backward(
     )
 
 
-def volume(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """`reference.plane_sweep_project`; `out` is memory of the answer's shape, any strides, to write to."""
+def plane_sweep_project(
+    source: Tensor, sites: Sites, options: Options, out: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """As `reference.plane_sweep_project`; `out` is memory of the answer's shape, any strides, to write to."""
     return _sample(*_lattice(VOLUMES, source, sites, options), source.dtype, options, out)
 
 
-def volume_backward(
+def plane_sweep_project_backward(
     gradient: Tensor,
     source: Tensor,
     sites: Sites,
@@ -399,5 +398,5 @@ def volume_backward(
     needs: Sequence[bool],
     into: Tensor | None = None,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """Vector-Jacobian product of `volume`, as `images_backward`."""
+    """Vector-Jacobian product of `plane_sweep_project`, as `unproject_backward`."""
     return _lattice_backward(VOLUMES, gradient, source, sites, options, needs, into)

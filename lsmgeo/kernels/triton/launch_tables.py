@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lsmgeo.kernels import reference
+from lsmgeo.kernels.lattice_geometry import lattice_extent, per_view, power_of_two_above, scale_below_overflow
 from lsmgeo.kernels.request import Options, Sites
 
 __all__ = ["Tables", "lattice_gradients", "tables"]
@@ -35,7 +35,7 @@ class Tables(NamedTuple):
 def tables(sites: Sites, options: Options, volume: bool) -> Tables:
     """Views left out have matrices of zeros: whatever stands in theirs reaches nobody."""
     mask = sites.view_mask
-    z = reference._per_view(sites.z, sites.matrix)
+    z = per_view(sites.z, sites.matrix)
     matrix, direction = sites.matrix, sites.direction if options.direction else None
     if mask is not None:
         z = torch.where(mask[..., None], z, 1.0)
@@ -45,13 +45,13 @@ def tables(sites: Sites, options: Options, volume: bool) -> Tables:
     kept = one if mask is None else mask.to(one.dtype)
     scale, shrink = one, None
     if not volume:  # homogeneous: a factor moves no pixel
-        scale = reference._scale_below_overflow(reference._lattice_extent(matrix, sites._replace(z=z)))
+        scale = scale_below_overflow(lattice_extent(matrix, sites._replace(z=z)))
         matrix = matrix * scale[..., None, None]
     fields = [matrix.flatten(2), scale[..., None], kept[..., None]]
     if direction is None:
         fields.append(one[..., None].expand(-1, -1, 14))
     else:
-        shrink = 1.0 / reference._power_of_two(direction.abs().amax((-1, -2)))
+        shrink = 1.0 / power_of_two_above(direction.abs().amax((-1, -2)))
         direction = direction * shrink[..., None, None]
         terms = direction.abs().amax(-2)
         constant = terms[..., 0] * sites.x.abs().amax(0) + terms[..., 1] * sites.y.abs().amax(0) + terms[..., 3]

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from lsmgeo._dtypes import saturating_cast
+from lsmgeo._torch_compat import as_constant
 from lsmgeo.kernels.request import Options, Sites
 from lsmgeo.kernels.triton.launch_tables import lattice_gradients, tables
 from lsmgeo.kernels.triton.launcher import (
@@ -30,12 +31,12 @@ from lsmgeo.kernels.triton.launcher import (
 )
 
 __all__ = [
-    "images",
-    "images_backward",
-    "pixels",
-    "pixels_backward",
-    "volume",
-    "volume_backward",
+    "plane_sweep_project",
+    "plane_sweep_project_backward",
+    "sample_views",
+    "sample_views_backward",
+    "unproject",
+    "unproject_backward",
     "why_not",
 ]
 
@@ -51,12 +52,9 @@ def why_not(operator: str, source: Tensor, options: Options) -> str | None:
     return None
 
 
+@as_constant
 def _is_installed() -> bool:
     return importlib.util.find_spec("triton") is not None
-
-
-# torch.compile takes the answer as a constant instead of looking into the search for a module.
-_is_installed._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def _is_interpreted() -> bool:
@@ -91,8 +89,8 @@ def _forward(
 
 
 @torch.no_grad()
-def images(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
-    """`reference.unproject`: images (B, V, C, h, w) at the sites of a lattice.
+def unproject(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
+    """As `reference.unproject`: images (B, V, C, h, w) at the sites of a lattice.
 
     Returns:
         (B, V, C', D, H, W), or (B, C'', D, H, W) where options.reduce is set, channels last in memory, and visibility
@@ -107,10 +105,10 @@ def images(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tens
 
 
 @torch.no_grad()
-def images_backward(
+def unproject_backward(
     gradient: Tensor, source: Tensor, sites: Sites, options: Options, needs: tuple[bool, bool, bool, bool]
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """The vector-Jacobian product of `images`.
+    """The vector-Jacobian product of `unproject`.
 
     Args:
         gradient: of its values, any strides.
@@ -178,7 +176,7 @@ def _launch_backward(
 
 
 @torch.no_grad()
-def pixels(
+def sample_views(
     source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options
 ) -> tuple[Tensor, Tensor]:
     """Sample images (B, V, C, h, w) at given pixels; the options' depth and direction have been seen to.
@@ -210,7 +208,7 @@ def _points(pixels: Tensor, front: Tensor, extra: Tensor | None) -> tuple[Tensor
 
 
 @torch.no_grad()
-def pixels_backward(
+def sample_views_backward(
     gradient: Tensor,
     source: Tensor,
     pixels: Tensor,
@@ -219,7 +217,7 @@ def pixels_backward(
     options: Options,
     needs: tuple[bool, bool, bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    """The vector-Jacobian product of `pixels`: gradients to source, pixels and extra, in their dtypes.
+    """The vector-Jacobian product of `sample_views`: gradients to source, pixels and extra, in their dtypes.
 
     Args:
         gradient: of its values, any strides.
@@ -251,8 +249,10 @@ def pixels_backward(
 
 
 @torch.no_grad()
-def volume(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """`reference.plane_sweep_project`: volumes (B, C, D, H, W) at the sites of the views' frustums.
+def plane_sweep_project(
+    source: Tensor, sites: Sites, options: Options, out: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """As `reference.plane_sweep_project`: volumes (B, C, D, H, W) at the sites of the views' frustums.
 
     Args:
         source: the volumes.
@@ -265,7 +265,7 @@ def volume(source: Tensor, sites: Sites, options: Options, out: Tensor | None = 
     """
     (B, C), V = source.shape[:2], sites.matrix.shape[1]
     channels, (P, h, w) = C + _extras(options), (sites.z.shape[-1], len(sites.y), len(sites.x))
-    if out is None and options.stacked:
+    if out is None and options.flatten:
         out = source.new_empty((B, V, h, w, channels, P)).permute(0, 1, 4, 5, 2, 3)
     elif out is None:
         out = empty_channels_last(B, V, channels, P, h, w, like=source)
@@ -279,7 +279,7 @@ def _seen_by(source: Tensor, V: int) -> Tensor:
 
 
 @torch.no_grad()
-def volume_backward(
+def plane_sweep_project_backward(
     gradient: Tensor,
     source: Tensor,
     sites: Sites,
@@ -287,7 +287,7 @@ def volume_backward(
     needs: tuple[bool, bool, bool, bool],
     into: Tensor | None = None,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """The vector-Jacobian product of `volume`, as `images_backward`.
+    """The vector-Jacobian product of `plane_sweep_project`, as `unproject_backward`.
 
     Args:
         gradient: of its maps, any strides.

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lsmgeo._checks import check_whole, describe
-from lsmgeo.cameras import CameraTensors, as_tensors, orbit, rays
+from lsmgeo.cameras import CameraTensors, as_tensors, orbit, resize, unproject_depth
 from lsmgeo.errors import DTypeError, ShapeError
 
 if TYPE_CHECKING:
@@ -166,19 +166,21 @@ def draw_depth(
     if depth.dim() != 2 or min(depth.shape) < 2:
         raise ShapeError(f"draw_depth: depth must be (h, w), each at least 2; got {tuple(depth.shape)}")
     camera = as_tensors(camera, "draw_depth")
-    R = camera.cam_from_world[:3, :3].double().cpu().numpy()
-    origin, directions = (value.double().cpu().numpy() for value in rays(camera, (depth.shape[0], depth.shape[1])))
     z = depth.detach().double().cpu().numpy()
     known = np.isfinite(z) & (z > 0)
-    lattice = directions / (directions @ R[2])[..., None]  # at depth 1
-    pixel = float(np.linalg.norm(lattice[0, 1] - lattice[0, 0]) * (np.median(z[known]) if known.any() else 1.0))
-    points = origin + lattice * np.where(known, z, 1.0)[..., None]
+    # At depth 1 where there is none.
+    filled = torch.from_numpy(np.where(known, z, 1.0)).to(camera.device)
+    points = unproject_depth(camera.at(None), filled[None, None])[0, 0].cpu().numpy()
+    pixel = float(np.median(z[known]) if known.any() else 1.0) / float(resize(camera, *depth.shape).intrinsics[0, 0])
     ends = [(rows, columns) for rows in (slice(-1), slice(1, None)) for columns in (slice(-1), slice(1, None))]
     corners = np.stack([points[end] for end in ends], 2)
     is_whole = np.logical_and.reduce([known[end] for end in ends])
     is_whole &= np.linalg.norm(corners - np.roll(corners, 1, 2), axis=-1).max(-1) < STEEPEST * pixel
     quads = corners[is_whole]  # (Q, 4, 3)
-    view = Rotation.from_euler("yx", (turn, lift), degrees=True).as_matrix() @ R
+    view = (
+        Rotation.from_euler("yx", (turn, lift), degrees=True).as_matrix()
+        @ camera.cam_from_world[:3, :3].double().cpu().numpy()
+    )
     normals = np.cross(quads[:, 3] - quads[:, 0], quads[:, 1] - quads[:, 2])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     normals *= -np.sign(normals @ view[2])[:, None]  # towards the viewer

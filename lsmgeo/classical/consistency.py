@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lsmgeo import functional
 from lsmgeo._checks import check_float, check_positive
-from lsmgeo.cameras import CameraTensors, resize
+from lsmgeo.cameras import CameraTensors, centers, project, resize, unproject_depth
 from lsmgeo.errors import ShapeError
 
 __all__ = ["consistent_views"]
@@ -52,7 +52,7 @@ def consistent_views(
 
     Example:
         >>> import torch
-        >>> from lsmgeo.cameras import CameraTensors, resize
+        >>> from lsmgeo.cameras import CameraTensors, centers, project, resize, unproject_depth
         >>> from lsmgeo.classical import consistent_views
         >>> K = torch.tensor([[4.0, 0.0, 1.5], [0.0, 4.0, 1.0], [0.0, 0.0, 1.0]])
         >>> E = torch.eye(4)
@@ -75,36 +75,23 @@ def consistent_views(
     for name, number in (("pixels", pixels), ("relative", relative)):
         check_positive("consistent_views", name, number)
     height, width = depth.shape
-    camera = resize(camera, height, width)
+    camera = resize(camera.to(torch.float64), height, width).at(None)
     with torch.no_grad():
         y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-        own = torch.stack((x, y), -1).reshape(-1, 2).double()
+        own = torch.stack((x, y), -1).reshape(-1, 2)
         start, known = depth.double().reshape(-1), depth.reshape(-1) > 0
-        points = _points(camera, own, start)
+        points = unproject_depth(camera, depth.double()[None, None]).reshape(1, -1, 3)
         count = torch.zeros(height * width, dtype=torch.int64)
         for other, other_camera in zip(other_depths, other_cameras, strict=True):
-            seen_by = resize(other_camera, *other.shape)
-            place, z = _pixels(seen_by, points)
+            seen_by = resize(other_camera.to(torch.float64), *other.shape)
+            place, z, _ = (part[0, 0] for part in project(seen_by.at(None), points))
             found = _depth_at(other, place, z, known)
-            back, distance = _pixels(camera, _points(seen_by, place, found))
+            # What the other map has there is on the same ray from the other camera, at another depth.
+            factor, center = found / torch.where(z > 0, z, 1.0), centers(seen_by)
+            back, distance, _ = (part[0, 0] for part in project(camera, center + factor[:, None] * (points - center)))
             agree = ((back - own).norm(dim=-1) <= pixels) & ((distance - start).abs() <= relative * start)
             count += known & (found > 0) & agree
         return count.reshape(height, width)
-
-
-def _points(camera: CameraTensors, pixels: Tensor, depth: Tensor) -> Tensor:
-    """World points (N, 3) of pixels (N, 2) at camera z (N,)."""
-    K, E = camera.intrinsics.double(), camera.cam_from_world.double()
-    rays = torch.linalg.solve(K, torch.cat((pixels, torch.ones_like(pixels[:, :1])), -1).T).T
-    return (depth[:, None] * rays - E[:3, 3]) @ E[:3, :3]
-
-
-def _pixels(camera: CameraTensors, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels (N, 2) and camera z (N,) of world points; the pixel of a point that is not in front means nothing."""
-    K, E = camera.intrinsics.double(), camera.cam_from_world.double()
-    seen = (points @ E[:3, :3].T + E[:3, 3]) @ K.T
-    z = seen[:, 2]
-    return seen[:, :2] / torch.where(z > 0, z, 1.0)[:, None], z
 
 
 def _depth_at(depth: Tensor, pixels: Tensor, z: Tensor, known: Tensor) -> Tensor:

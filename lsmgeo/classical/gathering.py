@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from lsmgeo.cameras import CameraTensors, resize, stack
+from lsmgeo.cameras import CameraTensors, resize
 from lsmgeo.data import PosedImages
 
 __all__ = ["fitted", "gather", "resized"]
@@ -32,7 +32,7 @@ def gather(scene: PosedImages, views: Sequence[int], size: int) -> tuple[Tensor,
     """
     shape = fitted(scene.size(views[0]), size)
     images = torch.stack([resized(scene.load(view), shape) for view in views])
-    return images, stack([resize(scene.camera(view), *shape) for view in views])
+    return images, resize(scene.cameras.at(list(views)), *shape)
 
 
 def fitted(size: Sequence[int], longest: int) -> tuple[int, int]:

@@ -12,7 +12,6 @@ from torch.nn.functional import avg_pool2d, pad
 
 from lsmgeo import functional
 from lsmgeo._checks import check_finite, check_float, check_mask, check_whole
-from lsmgeo.cameras import CameraTensors, select
 from lsmgeo.cameras.tensors import Cameras, as_tensors
 from lsmgeo.classical.correlation import INVALID_COST, Correlation, on_threads
 from lsmgeo.classical.sweep_options import SweepOptions
@@ -124,8 +123,8 @@ def warp_neighbours(
     if options.score == "zncc":
         # Correlation ignores an offset; without it squares lose less to rounding.
         images = images - images[0].detach().mean()
-    others = CameraTensors(*(torch.as_tensor(field)[1:] for field in tensors))
-    grid = FrustumGrid(select(tensors, 0, 0), depths, (images.shape[2], images.shape[3]))
+    others = tensors.at(slice(1, None))
+    grid = FrustumGrid(tensors.at(0), depths, (images.shape[2], images.shape[3]))
     slabs = functional.unproject_slabs(images[None, 1:], others, grid, max(1, planes_per_slab), padding_mode="border")
     return Warped(images[0], ((start, volume[0], visible[0]) for start, volume, visible in slabs))
 

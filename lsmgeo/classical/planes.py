@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from lsmgeo._checks import check_choice, check_number, check_whole
-from lsmgeo.cameras.tensors import Cameras, as_tensors
+from lsmgeo.cameras import as_tensors, project, unproject_depth
+from lsmgeo.cameras.tensors import Cameras
 from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.grids import depth_planes
 
@@ -16,6 +17,8 @@ __all__ = ["longest_path", "sweep_planes"]
 
 MOST_PLANES = 1 << 20
 SPACINGS = ("inverse", "depth", "disparity")
+# Pixels of a path that passes behind a neighbour.
+ENDLESS = 1e9
 
 
 def sweep_planes(cameras: Cameras, near: float, far: float, num: int = 300, spacing: str = "inverse") -> Tensor:
@@ -74,12 +77,9 @@ def longest_path(cameras: Cameras, near: float, far: float) -> float:
             f"longest_path: cameras must have leading shape (V,), V at least 2; "
             f"got {tuple(tensors.cam_from_world.shape[:-2])}"
         )
-    K, E = tensors.intrinsics.double(), tensors.cam_from_world.double()
-    height, width = (float(torch.as_tensor(size)[0]) for size in (tensors.height, tensors.width))
-    ray = torch.linalg.solve(K[0], K.new_tensor([(width - 1) / 2, (height - 1) / 2, 1.0]))
-    ends = []
-    for depth in (near, far):
-        world = E[0, :3, :3].T @ (depth * ray - E[0, :3, 3])
-        image = (K @ (E[:, :3, :3] @ world + E[:, :3, 3])[..., None])[1:, :, 0]
-        ends.append(image[:, :2] / image[:, 2:].clamp_min(1e-6 * depth))
-    return float((ends[0] - ends[1]).norm(dim=1).max())
+    # The only pixel of a map of one is at the centre of the image.
+    depth = torch.tensor([near, far], dtype=torch.float64).reshape(1, 2, 1, 1)
+    ends = unproject_depth(tensors.at([0, 0]), depth).reshape(1, 2, 3)
+    pixels, z, _ = project(tensors.at(slice(1, None)), ends, near=1e-6 * near)
+    path = (pixels[0, :, 0] - pixels[0, :, 1]).norm(dim=-1)
+    return float(torch.where((z[0] > 1e-6 * near).all(-1), path, ENDLESS).max())

@@ -8,6 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from lsmgeo.classical.plane_sweep import DepthMap
+from lsmgeo.classical.views import depth_of
 from lsmgeo.data import PosedImages
 
 __all__ = ["SparseError", "sparse_error"]
@@ -37,8 +38,7 @@ def sparse_error(scene: PosedImages, view: int, depth_map: DepthMap, mask: Tenso
     if scene.points is None:
         return None
     observed = scene.points.observations[view]
-    E = scene.cameras.cam_from_world[view].double().numpy()
-    expected = scene.points.positions[observed.points] @ E[2, :3] + E[2, 3]
+    expected = depth_of(scene, view, scene.points.positions[observed.points])
     height, width = depth_map.depth.shape
     full = scene.size(view)
     scale = np.array([width / full[1], height / full[0]])

@@ -12,7 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lsmgeo._checks import check_whole
-from lsmgeo.cameras import CameraTensors, rays, select, stack
+from lsmgeo.cameras import CameraTensors, centers, stack, unproject_depth
 from lsmgeo.classical.consistency import consistent_views
 from lsmgeo.classical.depth_range import find_depth_range
 from lsmgeo.classical.filtering import guided_filter
@@ -21,7 +21,7 @@ from lsmgeo.classical.plane_sweep import DepthMap, kept, run_sweep
 from lsmgeo.classical.planes import sweep_planes
 from lsmgeo.classical.sparse import SparseError, sparse_error
 from lsmgeo.classical.sweep_options import SweepOptions
-from lsmgeo.classical.views import camera_centers, default_depth_range, select_neighbours
+from lsmgeo.classical.views import default_depth_range, select_neighbours
 from lsmgeo.data import PosedImages
 from lsmgeo.drawing import as_pixels
 from lsmgeo.errors import OptionError
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 __all__ = [
     "Reconstruction",
     "SceneReconstruction",
-    "points_of",
     "reconstruct_scene",
     "reconstruct_view",
     "reconstruct_views",
@@ -242,7 +241,7 @@ def _sweep_view(scene: PosedImages, view: int, options: SweepOptions, *, progres
     depths = sweep_planes(cameras, near, far, options.planes, options.spacing)
     cost_filter = guided_filter(images[0]) if options.filtered else None
     depth_map = run_sweep(images, cameras, depths, options, cost_filter=cost_filter, progress=progress)
-    return _SweptView(view, tuple(matched), depths, images[0].clone(), select(cameras, 0, 0), depth_map)
+    return _SweptView(view, tuple(matched), depths, images[0].clone(), cameras.at(0), depth_map)
 
 
 def _depth_range(scene: PosedImages, view: int, options: SweepOptions) -> tuple[float, float]:
@@ -264,8 +263,8 @@ def _keep(
     """The best pixels of one view that at least so many of the others agree with."""
     depth_map, support = one.depth_map, None
     depth, allowed = depth_map.depth, depth_map.confidence > LEAST_CONFIDENCE
-    away = np.linalg.norm((centers := camera_centers(scene.cameras)) - centers[one.view], axis=1)
-    others = sorted((other for other in swept if other is not one), key=lambda other: float(away[other.view]))
+    away = (origins := centers(scene.cameras)) - origins[one.view]
+    others = sorted((other for other in swept if other is not one), key=lambda other: float(away[other.view].norm()))
     if others := others[:MOST_CHECKED]:
         maps, cameras = [other.depth_map.depth for other in others], [other.camera for other in others]
         support = consistent_views(depth, one.camera, maps, cameras)
@@ -276,7 +275,8 @@ def _keep(
         depth_map = depth_map._replace(confidence=torch.where(depth > 0, confidence, 0.0))
     specks = round(SPECK_FRACTION * depth.numel())
     mask = kept(depth_map._replace(depth=torch.where(allowed, depth, 0.0)), density, specks=specks)
-    points, colours = points_of(depth, one.camera)[mask].float().numpy(), as_pixels(one.image)[mask]
+    points = unproject_depth(one.camera.at(None), depth[None, None].double())[0, 0][mask].float().numpy()
+    colours = as_pixels(one.image)[mask]
     error = sparse_error(scene, one.view, depth_map, kept(depth_map, density))
     return Reconstruction(*one[:-1], depth_map, mask, points, colours, error, support)
 
@@ -299,17 +299,3 @@ def surface_of(swept: Sequence[Reconstruction], points: np.ndarray, resolution: 
     depths = (torch.where(one.mask, one.depth_map.depth, 0.0) for one in swept)
     fused = fuse_depth(depths, stack([one.camera for one in swept]), grid, colours=(one.image for one in swept))
     return extract_mesh(fused, grid, specks=SPECK_FACES)
-
-
-def points_of(depth: Tensor, camera: CameraTensors) -> Tensor:
-    """World positions of a depth map's pixels.
-
-    Args:
-        depth: (h, w) camera z.
-        camera: leading shape (), of images of that size.
-
-    Returns:
-        (h, w, 3) float64.
-    """
-    origin, directions = (value.double() for value in rays(camera, (depth.shape[0], depth.shape[1])))
-    return origin + directions * (depth.double() / (directions @ camera.cam_from_world[2, :3].double()))[..., None]

@@ -12,8 +12,7 @@ from torch.nn.functional import max_pool2d, pad
 from lsmgeo import functional
 from lsmgeo._checks import check_finite, check_geometry, check_mask, check_positive, check_whole, describe
 from lsmgeo._sites import Cameras
-from lsmgeo.cameras import CameraTensors, as_tensors, resize, stack
-from lsmgeo.cameras.tensors import select
+from lsmgeo.cameras import CameraTensors, as_tensors, resize, unproject_depth
 from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
 from lsmgeo.grids import VoxelGrid
 
@@ -116,7 +115,7 @@ def fuse_depth(
                 sums = _Sums(grid, maps.depth, coloured=colours is not None)
             elif maps.depth.dtype != sums.distance.dtype:
                 raise DTypeError(f"{who}: depths must be of one dtype; got {sums.distance.dtype}, {maps.depth.dtype}")
-            _fuse_view(sums, maps, select(tensors, 0, view), grid, truncation, memory)
+            _fuse_view(sums, maps, tensors.at(view), grid, truncation, memory)
     assert sums is not None  # cameras are at least one
     return sums.finish()
 
@@ -160,7 +159,7 @@ def _fuse_view(
     camera = resize(camera, height, width)
     smooth, nearest = _feature_maps(maps, camera, truncation)
     planes = _slab_planes(grid, smooth, memory)
-    views, augment = stack([camera]), ("depth", "direction")
+    views, augment = camera.at(None), ("depth", "direction")
     interpolated = functional.unproject_slabs(
         smooth, views, grid, planes, padding_mode="border", augment=augment, direction_frame="camera"
     )
@@ -263,8 +262,8 @@ def _cosine(inverse: Tensor, camera: CameraTensors) -> Tensor:
     u, v = u.to(inverse), v.to(inverse)
     du, dv = _slope(inverse, 1), _slope(inverse, 0)
     normal = torch.stack((du, dv, inverse - du * u - dv * v), -1) @ K
-    ray = torch.linalg.solve_triangular(K, torch.stack((u, v, torch.ones_like(u)), -1).reshape(-1, 3).T, upper=True)
-    length = ray.norm(dim=0).reshape(height, width)
+    at_origin = camera._replace(cam_from_world=torch.eye(4).to(camera.cam_from_world)).at(None)
+    length = unproject_depth(at_origin, torch.ones_like(inverse)[None, None])[0, 0].norm(dim=-1)
     found = inverse > 0
     return torch.where(found, (inverse / (normal.norm(dim=-1) * length).clamp_min(1e-30)).clamp(0, 1), 0)
 

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from lsmgeo._checks import check_whole
-from lsmgeo.cameras import CameraTensors, resize, stack
+from lsmgeo.cameras import CameraTensors, centers, project, resize
 from lsmgeo.data import PosedImages
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import FrustumGrid, depth_planes
 
 __all__ = [
-    "camera_centers",
     "common_point",
     "default_depth_range",
+    "depth_of",
     "measured_depth_range",
-    "project",
     "select_neighbours",
 ]
 
@@ -32,22 +32,6 @@ LEAST_DEPTHS = 10
 LARGEST_DISPARITY, SMALLEST_DISPARITY = 0.3, 0.01
 
 
-def camera_centers(cameras: CameraTensors) -> np.ndarray:
-    """Camera centres ``-R^T t``, (V, 3)."""
-    E = cameras.cam_from_world.double().numpy()
-    return -np.einsum("vji,vj->vi", E[:, :3, :3], E[:, :3, 3])
-
-
-def project(cameras: CameraTensors, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels (V, N, 2), camera z (V, N) and visibility (V, N) of points (N, 3); pixels mean nothing unless in front."""
-    K, E = (value.double().numpy() for value in cameras[:2])
-    seen = points @ E[:, :3, :3].swapaxes(1, 2) + E[:, None, :3, 3]
-    z = seen[..., 2]
-    pixels = (seen @ K.swapaxes(1, 2))[..., :2] / np.where(z > 0, z, 1.0)[..., None]
-    sizes = np.stack([np.broadcast_to(np.asarray(size), len(K)) for size in (cameras.width, cameras.height)], -1)
-    return pixels, z, (z > 0) & ((pixels >= -0.5) & (pixels < sizes[:, None] - 0.5)).all(-1)
-
-
 def common_point(cameras: CameraTensors) -> np.ndarray:
     """The point nearest to all optical axes in the least-squares sense, (3,).
 
@@ -55,9 +39,9 @@ def common_point(cameras: CameraTensors) -> np.ndarray:
     """
     axes = cameras.cam_from_world[:, 2, :3].double().numpy()
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    centers = camera_centers(cameras)
-    middle = centers.mean(0)
-    right = np.einsum("vij,vj->i", projectors, centers - middle)
+    origins = centers(cameras).double().numpy()
+    middle = origins.mean(0)
+    right = np.einsum("vij,vj->i", projectors, origins - middle)
     # Parallel axes meet nowhere; the pseudo-inverse then stays among the cameras instead of failing.
     return np.asarray(middle + np.linalg.pinv(projectors.sum(0), rcond=1e-6) @ right)
 
@@ -87,12 +71,13 @@ def select_neighbours(
     """
     check_whole("select_neighbours", "view", view, 0, len(scene) - 1)
     check_whole("select_neighbours", "count", count, 1)
-    centers = camera_centers(scene.cameras)
+    origins = centers(scene.cameras).numpy()
     frustum = np.empty((0, 3))
     if scene.points is None:
         if near is None or far is None:
             near, far = default_depth_range(scene, view)
         frustum = _frustum_points(scene, view, near, far)
+        visible = project(scene.cameras, torch.from_numpy(frustum)[None]).visible[0].numpy()
     scores, angles = {}, {}
     for other in range(len(scene)):
         if other == view:
@@ -103,18 +88,18 @@ def select_neighbours(
             if weight < LEAST_SHARED_POINTS:
                 continue
         else:
-            points = frustum[project(stack([scene.camera(other)]), frustum)[2][0]]
+            points = frustum[visible[other]]
             weight = len(points) / len(frustum)
             if weight < LEAST_SHARED_FRUSTUM:
                 continue
-        angle = float(np.median(_angles(centers[view], centers[other], points)))
+        angle = float(np.median(_angles(origins[view], origins[other], points)))
         if SMALLEST_ANGLE < angle < LARGEST_ANGLE:
             spread = 5.0 if angle < BEST_ANGLE else 20.0
             scores[other] = weight * np.exp(-0.5 * ((angle - BEST_ANGLE) / spread) ** 2)
             angles[other] = points
     chosen: list[int] = []
     for other in sorted(scores, key=lambda index: -scores[index]):
-        spacings = [np.median(_angles(centers[other], centers[taken], angles[other])) for taken in chosen]
+        spacings = [np.median(_angles(origins[other], origins[taken], angles[other])) for taken in chosen]
         if all(spacing > SMALLEST_SPACING for spacing in spacings):
             chosen.append(other)
         if len(chosen) == count:
@@ -148,11 +133,9 @@ def measured_depth_range(scene: PosedImages, view: int) -> tuple[float, float] |
         DataError: the depth that comes with the photograph cannot be read.
     """
     check_whole("measured_depth_range", "view", view, 0, len(scene) - 1)
-    E = scene.cameras.cam_from_world[view].double().numpy()
     depth = np.empty(0)
     if scene.points is not None:
-        seen = scene.points.positions[scene.points.observations[view].points]
-        depth = seen @ E[2, :3] + E[2, 3]
+        depth = depth_of(scene, view, scene.points.positions[scene.points.observations[view].points])
     elif (measured := scene.load_depth(view)) is not None:
         depth = measured.double().flatten().numpy()
     depth = depth[depth > 0]
@@ -161,6 +144,11 @@ def measured_depth_range(scene: PosedImages, view: int) -> tuple[float, float] |
     low, high = np.percentile(depth, (2, 98))
     margin = 0.25 * (high - low) + 0.02 * low
     return float(max(low - margin, 0.5 * low)), float(high + margin)
+
+
+def depth_of(scene: PosedImages, view: int, points: np.ndarray) -> np.ndarray:
+    """Camera z (N,) of points (N, 3) in one view."""
+    return project(scene.camera(view).at(None), torch.from_numpy(points)[None]).depth[0, 0].numpy()
 
 
 def default_depth_range(scene: PosedImages, view: int) -> tuple[float, float]:
@@ -181,13 +169,11 @@ def default_depth_range(scene: PosedImages, view: int) -> tuple[float, float]:
     measured = measured_depth_range(scene, view)
     if measured is not None:
         return measured
-    focus = common_point(scene.cameras)
-    E = scene.cameras.cam_from_world[view].double().numpy()
     K = scene.cameras.intrinsics[view].double().numpy()
     height, width = scene.size(view)
-    middle = float(E[2, :3] @ focus + E[2, 3])
-    centers = camera_centers(scene.cameras)
-    away = np.linalg.norm(centers - centers[view], axis=1)
+    middle = float(depth_of(scene, view, common_point(scene.cameras)[None])[0])
+    origins = centers(scene.cameras).numpy()
+    away = np.linalg.norm(origins - origins[view], axis=1)
     # Parallel axes: rounding alone decides how far before or behind the cameras they meet.
     if middle > 1e-6 * away.max():
         radius = 0.75 * middle * float(min(0.5 * width / K[0, 0], 0.5 * height / K[1, 1]))

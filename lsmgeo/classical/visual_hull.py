@@ -13,8 +13,7 @@ from torch.nn.functional import adaptive_max_pool2d, pad
 from lsmgeo import functional
 from lsmgeo._checks import check_choice, check_finite, check_geometry, check_number, check_whole, describe
 from lsmgeo._sites import Cameras
-from lsmgeo.cameras import CameraTensors, as_tensors, crop, rays, resize, stack
-from lsmgeo.cameras.tensors import select
+from lsmgeo.cameras import CameraTensors, as_tensors, crop, rays, resize
 from lsmgeo.classical.gathering import fitted
 from lsmgeo.classical.silhouettes import signed_distance
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
@@ -119,7 +118,7 @@ def visual_hull(
     with torch.no_grad():
         # One view after another: its picture stays in the caches, and memory does not grow with the views.
         for view, values in enumerate(maps):
-            camera = stack([select(tensors, len(leading) - 1, view)], len(leading) - 1)
+            camera = tensors.at((..., slice(view, view + 1)))
             features = values[:, None, None]
             for first, volume, visible in functional.unproject_slabs(
                 features, camera, grid, planes, padding_mode="border"
@@ -196,7 +195,7 @@ def hull_box(
             raise DTypeError(f"{who}: masks[{view}] must be a bool tensor (h, w); got {describe(mask)}")
         if not bool(mask.any()):
             raise OptionError(f"{who}: the silhouette of view {view} is empty")
-    pictures = [_thinned(mask, select(tensors, 0, view)) for view, mask in enumerate(masks)]
+    pictures = [_thinned(mask, tensors.at(view)) for view, mask in enumerate(masks)]
     middle, radius = _ball(pictures)
     wide = [_with_rim(mask, camera) for mask, camera in pictures]
     lower, upper = middle - radius, middle + radius
@@ -267,15 +266,15 @@ def _with_rim(mask: Tensor, camera: CameraTensors) -> Picture:
 def _carved(pictures: Sequence[Picture], lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The box around those voxels of a coarse grid that may reach into the hull."""
     grid = VoxelGrid(COARSE, lower.tolist(), upper.tolist())
-    centers = grid.lattice().centers()
     half = 0.5 * float(np.linalg.norm((upper - lower) / COARSE))
     keep = torch.ones(grid.shape, dtype=torch.bool)
     for distance, camera in pictures:
-        volume, visible = functional.unproject(distance[None, None, None], stack([camera]), grid, padding_mode="border")
-        E, K = camera.cam_from_world.double(), camera.intrinsics.double()
-        depth = (centers @ E[2, :3] + E[2, 3]).clamp_min(1e-9)
+        volume, visible = functional.unproject(
+            distance[None, None, None], camera.at(None), grid, padding_mode="border", augment="depth"
+        )
+        depth = volume[0, 0, 1].double().clamp_min(1e-9)
         # A ball of radius r at depth z projects into one of about f r / (z - r) pixels.
-        reach = float(K[:2, :2].abs().max()) * half / (depth - half).clamp_min(0.25 * half)
+        reach = float(camera.intrinsics[:2, :2].abs().max()) * half / (depth - half).clamp_min(0.25 * half)
         keep &= (volume[0, 0, 0] > -1.5 * reach - 1) & visible[0, 0]
     if not bool(keep.any()):
         raise OptionError(

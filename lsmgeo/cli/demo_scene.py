@@ -17,9 +17,7 @@ import torch
 from torch import Tensor
 
 from lsmgeo import PlaneSweepProject, Unproject, VoxelGrid, depth_planes, scenes
-from lsmgeo.cameras import CameraTensors, orbit, rays, select, stack
-from lsmgeo.classical.stereo import points_of
-from lsmgeo.classical.views import project
+from lsmgeo.cameras import CameraTensors, centers, orbit, project, unproject_depth
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -87,10 +85,9 @@ def _picture(
 
     Surfaces outside the box are left out; their depth is 0.
     """
-    batch = stack([cameras])
     dark = scenes.Lights(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(3))
-    depth = scenes.render([scene], batch, dark, dtype=torch.float64).depth[0]
-    points = torch.stack([points_of(one, select(cameras, 0, view)) for view, one in enumerate(depth)])
+    depth = scenes.render([scene], cameras.at(None), dark, dtype=torch.float64).depth[0]
+    points = unproject_depth(cameras, depth[None])[0]
     hit = (depth > 0) & ((points >= lower) & (points <= upper)).all(-1)
     # Noise, different in every view: a plain background would agree with itself in empty space.
     noise = torch.rand(points.shape[:-1], generator=torch.Generator().manual_seed(0), dtype=points.dtype)
@@ -100,10 +97,10 @@ def _picture(
 
 def _seen_by(points: Tensor, cameras: CameraTensors, scene: scenes.Scene) -> Tensor:
     """How many cameras see each surface point (H, W, 3): in the picture, and with nothing in between."""
-    origins = rays(cameras)[0][:, None]  # (V, 1, 3)
+    origins = centers(cameras)[:, None]  # (V, 1, 3)
     towards = points.reshape(1, -1, 3) - origins  # (V, H * W, 3)
     first = scenes.trace([scene], origins.expand_as(towards).reshape(1, -1, 3), towards.reshape(1, -1, 3)).distance
-    inside = torch.from_numpy(project(cameras, points.reshape(-1, 3).numpy())[2])
+    inside = project(cameras, points.reshape(1, -1, 3)).visible[0]
     return (inside & (first.view(inside.shape) > 1 - 1e-3)).sum(0).view(points.shape[:2])
 
 
@@ -131,15 +128,13 @@ def run_demo(*, size: tuple[int, int] = (120, 160), voxels: int = 72, planes: in
     images = images.float()
 
     start = time.perf_counter()
-    batch = stack([cameras])
     unproject = Unproject(grid, reduce="variance", padding_mode="border")
-    variance, visible = unproject(images[None], batch)
+    variance, visible = unproject(images[None], cameras)
     enough = visible.sum(1, keepdim=True) >= 3
     agreement = torch.where(enough, torch.exp(-variance.sum(1, keepdim=True) / TOLERANCE), 0.0)
 
-    reference = stack([stack([select(cameras, 0, view)])])
     sweep_depths = depth_planes(1.4, 3.4, planes)
-    swept = PlaneSweepProject(grid, sweep_depths, size)(agreement, reference).maps[0, 0]  # (P, H, W)
+    swept = PlaneSweepProject(grid, sweep_depths, size)(agreement, cameras.at([view])).maps[0, 0]  # (P, H, W)
     depth = _peak(swept, sweep_depths)
     seconds = time.perf_counter() - start
 

@@ -105,7 +105,7 @@ class PosedImages:
 
     def camera(self, view: int) -> CameraTensors:
         """The camera of one view, leading shape ()."""
-        return type(self.cameras)(*(torch.as_tensor(value)[view] for value in self.cameras))
+        return self.cameras.at(view)
 
     def size(self, view: int) -> tuple[int, int]:
         """(height, width) of one image in pixels."""

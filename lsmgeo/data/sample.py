@@ -101,7 +101,7 @@ class Batch(NamedTuple):
 
 def first_views(cameras: CameraTensors, views: int) -> CameraTensors:
     """The first views of cameras with the leading shape (B, V)."""
-    return CameraTensors(*(torch.as_tensor(field)[:, :views] for field in cameras))
+    return cameras.at((slice(None), slice(views)))
 
 
 def check_sample(sample: Sample, who: str = "sample") -> CameraTensors:

@@ -60,6 +60,5 @@ def sweep_views(images: Tensor, cameras: CameraTensors, *, planes: int, window: 
     maps = []
     for view in range(len(images)):
         order = [view, *(other for other in range(len(images)) if other != view)]
-        some = CameraTensors(*(torch.as_tensor(field)[order] for field in cameras))
-        maps.append(sweep(images[order], some, depths, score="zncc", window=window))
+        maps.append(sweep(images[order], cameras.at(order), depths, score="zncc", window=window))
     return DepthMaps(torch.stack([one.depth for one in maps]), torch.stack([one.confidence for one in maps]))

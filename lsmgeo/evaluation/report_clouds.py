@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lsmgeo.cameras import CameraTensors, select
-from lsmgeo.classical.stereo import points_of
+from lsmgeo.cameras import CameraTensors, unproject_depth
 from lsmgeo.data import Batch
 from lsmgeo.data.sample import first_views
 from lsmgeo.drawing import Pixels, as_pixels, draw_depth, draw_points
@@ -61,7 +60,7 @@ def report_clouds(methods: Sequence[Method], shapes: Shapes, views: int, options
         assert batch.mask is not None
         found |= {(TRUTH, count): batch.depth[0, :count] for count in counts}
         found = {key: torch.where(batch.mask[0, : key[1]], depth, 0.0) for key, depth in found.items()}
-        joint = {key: joint_cloud(depth, batch.images[0], select(batch.cameras, 0, 0)) for key, depth in found.items()}
+        joint = {key: joint_cloud(depth, batch.images[0], batch.cameras.at(0)) for key, depth in found.items()}
         figures[f"clouds-{_file(shape)}"] = _draw(shape, batch, counts, (TRUTH, *names), found, joint)
         for (name, count), cloud in joint.items():
             clouds[f"clouds-{_file(shape)}-{_file(name)}-{count}"] = cloud
@@ -89,7 +88,7 @@ def report_clouds(methods: Sequence[Method], shapes: Shapes, views: int, options
 def _depths(methods: Sequence[Method], batch: Batch, count: int, options: Options) -> dict[str, Tensor]:
     """Depth (count, H, W) of every method from the first views of one shape."""
     images, cameras = batch.images[:, :count], first_views(batch.cameras, count)
-    swept = sweep_views(images[0], select(cameras, 0, 0), planes=options.planes, window=options.window).depth
+    swept = sweep_views(images[0], cameras.at(0), planes=options.planes, window=options.window).depth
     return {SWEEP: swept} | {one.name: one.depths(images, cameras)[0] for one in methods}
 
 
@@ -101,12 +100,9 @@ def joint_cloud(depth: Tensor, images: Tensor, cameras: CameraTensors) -> tuple[
         images: at least V, (3, H, W) each.
         cameras: at least V, of the size of the maps.
     """
-    positions, colours = [], []
-    for view, one in enumerate(depth):
-        has_depth = one > 0
-        positions.append(points_of(one, select(cameras, 0, view))[has_depth])
-        colours.append(as_pixels(images[view])[has_depth])
-    return torch.cat(positions).numpy(), np.concatenate(colours)
+    has_depth = depth > 0
+    points = unproject_depth(cameras.at(slice(len(depth))), depth.double()[None])[0]
+    return points[has_depth].numpy(), np.stack([as_pixels(image) for image in images[: len(depth)]])[has_depth]
 
 
 def _draw(
@@ -117,7 +113,7 @@ def _draw(
     depths: dict[tuple[str, int], Tensor],
     clouds: dict[tuple[str, int], tuple[np.ndarray, np.ndarray]],
 ) -> bytes:
-    camera = select(select(batch.cameras, 0, 0), 0, 0)
+    camera = batch.cameras.at((0, 0))
     rows: list[list[Pixels | None]] = []
     for name in methods:
         shaded: list[Pixels | None] = [draw_depth(depths[name, count][0], camera, size=SIDE) for count in counts]

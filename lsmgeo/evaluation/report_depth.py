@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from lsmgeo.cameras import select
 from lsmgeo.data import Batch
 from lsmgeo.drawing import Pixels, as_pixels, draw_depth
 from lsmgeo.evaluation.baselines import SURE, SWEEP, DepthMaps, sweep_views
@@ -51,7 +50,7 @@ def report_depth(methods: Sequence[Method], shapes: Shapes, views: int, options:
         assert batch.depth is not None
         assert batch.mask is not None
         sweeps = [
-            sweep_views(images, select(batch.cameras, 0, place), planes=options.planes, window=options.window)
+            sweep_views(images, batch.cameras.at(place), planes=options.planes, window=options.window)
             for place, images in enumerate(batch.images)
         ]
         swept = DepthMaps(*(torch.stack(maps) for maps in zip(*sweeps, strict=True)))
@@ -111,6 +110,6 @@ def _draw(batch: Batch, place: int, depths: Sequence[Tensor]) -> list[Pixels | N
     """The first view of a shape, its true depth and the depths (B, V, H, W) of methods, as shaded surfaces."""
     assert batch.depth is not None
     assert batch.mask is not None
-    camera, on_object = select(select(batch.cameras, 0, place), 0, 0), batch.mask[place, 0]
+    camera, on_object = batch.cameras.at((place, 0)), batch.mask[place, 0]
     surfaces = [torch.where(on_object, depth[place, 0].float(), 0.0) for depth in (batch.depth, *depths)]
     return [as_pixels(batch.images[place, 0], SIDE), *(draw_depth(one, camera, size=SIDE) for one in surfaces)]

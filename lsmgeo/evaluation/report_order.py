@@ -111,7 +111,7 @@ def _orders(seed: int, name: str, views: int, orders: int) -> Tensor:
 def _reordered(images: Tensor, cameras: CameraTensors, order: Tensor) -> tuple[Tensor, CameraTensors]:
     """Views (B, K) out of (B, V)."""
     rows = torch.arange(len(order))[:, None]
-    return images[rows, order], CameraTensors(*(torch.as_tensor(field)[rows, order] for field in cameras))
+    return images[rows, order], cameras.at((rows, order))
 
 
 def _spread(predicted: Tensor, iou: Tensor, threshold: float) -> Tensor:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from lsmgeo.cameras import CameraTensors, perturb, select, stack
+from lsmgeo.cameras import CameraTensors, perturb, stack
 from lsmgeo.data import Batch
 from lsmgeo.evaluation.baselines import HULL, hull_iou
 from lsmgeo.evaluation.held_out_shapes import Shapes, batches, noise_of
@@ -81,7 +81,7 @@ def with_noise(batch: Batch, degrees: float, seed: int) -> CameraTensors:
     """
     return stack(
         [
-            perturb(select(batch.cameras, 0, place), degrees, generator=noise_of(seed, name))
+            perturb(batch.cameras.at(place), degrees, generator=noise_of(seed, name))
             for place, name in enumerate(batch.name)
         ]
     )

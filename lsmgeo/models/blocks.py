@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d, conv3d, conv_transpose2d, conv_transpose3d, group_norm, pad
 
 from lsmgeo._checks import check_flag
-from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes
-from lsmgeo.errors import ShapeError
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors
 from lsmgeo.grids import VoxelGrid
 from lsmgeo.models.outputs import VoxelResult
 
@@ -23,7 +22,6 @@ __all__ = [
     "InstanceNorm",
     "Model",
     "VoxelModel",
-    "cameras_by_scene",
     "evaluation_mode",
     "interleave",
     "shift_principal_point",
@@ -271,17 +269,3 @@ def shift_principal_point(who: str, cameras: Cameras, pixels: float) -> CameraTe
     offset = torch.zeros_like(tensors.intrinsics)
     offset[..., :2, 2] = pixels
     return tensors._replace(intrinsics=tensors.intrinsics + offset)
-
-
-def cameras_by_scene(who: str, cameras: Cameras, scenes: int) -> CameraTensors:
-    """Cameras of any form, with the leading shape (B, V)."""
-    tensors = as_tensors(cameras, who)
-    leading = tuple(tensors.cam_from_world.shape[:-2])
-    if len(leading) == 2 and leading[0] == scenes:
-        return tensors
-    if len(leading) != 1 or scenes == 0 or leading[0] % scenes:
-        raise ShapeError(f"{who}: cameras must have leading shape (B, V) or (B*V,) with B = {scenes}; got {leading}")
-    K, E, height, width = (
-        item.unflatten(0, (scenes, -1)) for item in (tensors.intrinsics, tensors.cam_from_world, *image_sizes(tensors))
-    )
-    return CameraTensors(K, E, height, width)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from lsmgeo._checks import check_flag
-from lsmgeo.cameras.tensors import Cameras, CameraTensors, image_sizes
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes, views_of, views_per_scene
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid, depth_planes
 from lsmgeo.layers import PlaneSweepProject
@@ -22,7 +22,6 @@ from lsmgeo.models.blocks import (
     Block,
     Convolution,
     InstanceNorm,
-    cameras_by_scene,
     evaluation_mode,
     shift_principal_point,
 )
@@ -189,7 +188,8 @@ class DepthLSM(LSMTrunk):
             )
         grids, early = self.encode(images, cameras, view_mask, steps)
         B, S = grids.shape[:2]
-        targets = cameras_by_scene(self.name, cameras if target_cameras is None else target_cameras, B)
+        targets = as_tensors(cameras if target_cameras is None else target_cameras, self.name)
+        targets = views_of(self.name, targets, views_per_scene(self.name, targets, B, "images'"))
         mask = view_mask if target_cameras is None else None
         if self.settings.pixel_rules == "release":
             # Rays pass the corner of a map's pixels.

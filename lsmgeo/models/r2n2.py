@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import leaky_relu
 
 from lsmgeo._checks import check_devices, check_float, check_mask
-from lsmgeo.cameras.tensors import Cameras, as_tensors, check_cameras
+from lsmgeo.cameras.tensors import Cameras, as_tensors, check_cameras, views_of
 from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.grids import VoxelGrid
 from lsmgeo.models.blocks import VoxelModel, interleave
@@ -281,16 +281,10 @@ class R2N2(VoxelModel):
 
     def _quaternions(self, cameras: Cameras, mask: Tensor, images: Tensor) -> Tensor:
         """(B, V, 4) as w, x, y, z; of masked views, whose cameras are not read, the identity."""
-        tensors = as_tensors(cameras, self.name)
-        views, leading = tuple(mask.shape), tuple(tensors.cam_from_world.shape[:-2])
-        if leading not in (views, (prod(views),)):
-            raise ShapeError(
-                f"{self.name}: cameras must have leading shape (B, V) = {views}, or (B*V,) with the view fastest; "
-                f"got {leading}"
-            )
+        tensors = views_of(self.name, as_tensors(cameras, self.name), (mask.shape[0], mask.shape[1]))
         check_devices(self.name, images=images, cameras=tensors.cam_from_world)
-        check_cameras(self.name, tensors, mask.reshape(leading))
-        R = tensors.cam_from_world[..., :3, :3].reshape(*views, 3, 3)
+        check_cameras(self.name, tensors, mask)
+        R = tensors.cam_from_world[..., :3, :3]
         R = torch.where(mask[..., None, None], R, torch.eye(3, dtype=R.dtype, device=R.device))
         quaternions = rotation_matrix_to_quaternion(R)
         return torch.where(quaternions[..., 3:] < 0, -quaternions, quaternions).to(images.dtype)

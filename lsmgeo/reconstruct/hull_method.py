@@ -11,12 +11,11 @@ from tqdm import tqdm
 
 from lsmgeo import functional
 from lsmgeo._checks import check_choice, check_whole
-from lsmgeo.cameras import CameraTensors, crop, resize, select, stack
+from lsmgeo.cameras import CameraTensors, crop, project, resize
 from lsmgeo.classical.gathering import fitted, resized
 from lsmgeo.classical.silhouettes import signed_distance, silhouettes
 from lsmgeo.classical.surface import drop_specks, extract_mesh
 from lsmgeo.classical.tsdf import voxel_side
-from lsmgeo.classical.views import camera_centers, project
 from lsmgeo.classical.visual_hull import RULES, default_grid, visual_hull
 from lsmgeo.data.meshes import Mesh
 from lsmgeo.errors import OptionError
@@ -83,7 +82,7 @@ def hull_results(
         if not bool(mask.any()):
             raise OptionError(f"{who}: the silhouette of view {number} ({scene.names[number]}) is empty")
     shape = fitted(scene.size(0), size)
-    cameras = stack([resize(scene.camera(number), *shape) for number in range(len(scene))])
+    cameras = resize(scene.cameras, *shape)
     outlines = torch.stack([resized(mask[None].float(), shape)[0] > 0.5 for mask in found])
     grid = default_grid(outlines, cameras, resolution)
     border = outlines.clone()
@@ -97,7 +96,7 @@ def hull_results(
         raise OptionError(f"{who}: no voxel lies in the silhouettes; rule='mean' forgives wrong ones")
     looked, ious = [], []
     for number, mask in enumerate(tqdm(outlines, desc="hull", unit="view", disable=None)):
-        camera, image = select(cameras, 0, number), resized(scene.load(number), shape)
+        camera, image = cameras.at(number), resized(scene.load(number), shape)
         depth = hull_depth(hull.occupancy, grid, camera)
         ious.append(outline_iou(depth, mask))
         numbers = (("IoU of silhouette and hull", f"{ious[-1]:.3f}"),)
@@ -149,7 +148,7 @@ def hull_depth(occupancy: Tensor, grid: VoxelGrid, camera: CameraTensors) -> Ten
     ends = torch.stack([index.amin(0).flip(0) - 0.5, index.amax(0).flip(0) + 0.5]).double()
     T = grid.world_from_lattice.double()
     corners = torch.cartesian_prod(*ends.unbind(1)) @ T[:3, :3].T + T[:3, 3]
-    pixels, z = (part[0] for part in project(stack([camera]), corners.numpy())[:2])
+    pixels, z = (part[0, 0].numpy() for part in project(camera.at(None), corners[None])[:2])
     # Of the shortest side, so that flat voxels are not stepped over.
     step = float(T[:3, :3].norm(dim=0).min()) / PLANES_PER_VOXEL
     nearest, farthest = float(z.min()), float(z.max())
@@ -160,7 +159,7 @@ def hull_depth(occupancy: Tensor, grid: VoxelGrid, camera: CameraTensors) -> Ten
         top, left, bottom, right = max(0, y0), max(0, x0), min(height, y1 + 1), min(width, x1 + 1)
     if top >= bottom or left >= right or farthest <= start:
         return depth
-    window = crop(stack([camera]), top, left, bottom - top, right - left)
+    window = crop(camera.at(None), top, left, bottom - top, right - left)
     size = bottom - top, right - left
     seen = depth[top:bottom, left:right]
     volume = occupancy[None, None].float()
@@ -188,22 +187,21 @@ def colour_vertices(mesh: Mesh, views: Sequence[Looked], behind: float) -> Mesh:
 
     if not len(mesh.vertices):
         return mesh
-    normals = np.asarray(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals)
+    normals = torch.tensor(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).vertex_normals).float()
     points = torch.from_numpy(mesh.vertices).float()[None]
     total, weight = torch.zeros(3, len(mesh.vertices)), torch.zeros(len(mesh.vertices))
     for view in views:
-        cameras = stack([view.camera])
+        cameras = view.camera.at(None)
         # By "zeros" the outer half pixel would fade to black.
         colours, _ = functional.unproject_points(view.image[None, None], cameras, points, padding_mode="border")
         depth, visible = functional.unproject_points(
-            view.depth[None, None, None], cameras, points, mode="nearest", augment=("depth",)
+            view.depth[None, None, None], cameras, points, mode="nearest", augment=("depth", "direction")
         )
-        known, z = depth[0, 0]
-        rays = camera_centers(cameras) - mesh.vertices
-        cosine = (rays * normals).sum(1) / np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
+        known, z, *ray = depth[0, 0]
+        cosine = -(torch.stack(ray, -1) * normals).sum(-1)
         seen = visible[0, 0] & (known > 0) & (z < known + behind)
         # Never nothing, so that what is seen at a grazing angle alone has a colour too.
-        each = torch.where(seen, torch.from_numpy(cosine).float().clamp_min(0.03) ** 4, 0.0)
+        each = torch.where(seen, cosine.clamp_min(0.03) ** 4, 0.0)
         total += each * colours[0, 0]
         weight += each
     mean = torch.where(weight > 0, total / weight.clamp_min(1e-12), 0.7)

@@ -13,11 +13,10 @@ from torch.nn.functional import interpolate
 
 from lsmgeo import rays
 from lsmgeo._checks import check_choice, check_number, check_whole
-from lsmgeo.cameras import CameraTensors, resize, stack
+from lsmgeo.cameras import CameraTensors, resize, stack, unproject_depth
 from lsmgeo.classical.consistency import consistent_views
 from lsmgeo.classical.gathering import fitted, resized
 from lsmgeo.classical.silhouettes import mask_folder, silhouettes
-from lsmgeo.classical.stereo import points_of
 from lsmgeo.classical.surface import drop_specks, extract_mesh
 from lsmgeo.classical.tsdf import fuse_depth, voxel_side
 from lsmgeo.drawing import as_pixels
@@ -125,8 +124,7 @@ def predict_scene(
         for number, outline in zip(chosen, outlines, strict=True)
     ]
     cameras = in_model_frame(stack([one.camera for one in framed]), placement)
-    scenes = CameraTensors(*(torch.as_tensor(part)[None] for part in cameras))
-    result = model.run(torch.stack([one.image for one in framed])[None], scenes, by_view=False)
+    result = model.run(torch.stack([one.image for one in framed])[None], cameras.at(None), by_view=False)
     notes = _notes(scene, first, usable, float(np.median(away[chosen])), has_masks=known is not None)
     return Prediction(result, placement, tuple(chosen), tuple(framed), tuple(outlines), notes)
 
@@ -274,7 +272,7 @@ def _with_depth(results: Results, found: Prediction, grid: VoxelGrid, resolution
         if others and bool((depth > 0).any()):
             numbers.append(("other views that agree", f"{float(support[depth > 0].float().mean()):.1f} on average"))
         looked.append(Looked(view, image, camera, depth, share.float(), "share of views that agree", tuple(numbers)))
-        points.append(points_of(depth, camera)[kept].float().numpy())
+        points.append(unproject_depth(camera.at(None), depth[None, None].double())[0, 0][kept].float().numpy())
         colours.append(as_pixels(image)[kept])
     side = min(resolution, FINEST)
     fine = VoxelGrid(side, grid.lower, grid.upper, placement.scene_from_model())
@@ -306,7 +304,7 @@ def _largest(probability: Tensor, grid: VoxelGrid, camera: CameraTensors, placem
     shape = fitted(whole, LARGEST_SAMPLED)
     middle = float(in_model_frame(camera, placement).cam_from_world[2, 3])
     planes = torch.linspace(max(middle - REACH, 1e-3), middle + REACH, PLANES, dtype=torch.float64) * placement.side
-    maps, _ = plane_sweep_project(probability[None, None], stack([stack([camera])]), grid, planes, shape)
+    maps, _ = plane_sweep_project(probability[None, None], camera.at(None), grid, planes, shape)
     largest = rays.max_along_rays(maps[0, 0])
     return resized(largest[None].clamp(0, 1), whole)[0]
 

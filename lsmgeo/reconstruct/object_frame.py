@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lsmgeo.cameras import CameraTensors, crop, resize, select, stack
+from lsmgeo.cameras import CameraTensors, centers, crop, project, resize, stack
 from lsmgeo.classical.gathering import fitted, resized
 from lsmgeo.classical.silhouettes import signed_distance
-from lsmgeo.classical.views import camera_centers, common_point, project
+from lsmgeo.classical.views import common_point
 from lsmgeo.classical.visual_hull import hull_box, visual_hull
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid
@@ -47,6 +47,7 @@ LEAST_GAIN = 0.9
 # To stand as in training, cameras must be that evenly far from what they look at, about which the object must be; its
 # box as outlines tell it may be larger than it, by far where all look from one height.
 EVEN, ALIKE, BESIDE = 0.01, (0.9, 1.6), 0.2
+ORIGIN = torch.zeros(1, 1, 3, dtype=torch.float64)
 
 
 class Placement(NamedTuple):
@@ -95,12 +96,12 @@ def place_object(scene: PosedImages, masks: Sequence[Tensor] | None, views: Sequ
     points, told_by, trimmed = None, "silhouettes", (0, 100)
     if masks is not None:
         try:
-            points = _hull_points(masks, CameraTensors(*(torch.as_tensor(part)[list(views)] for part in turned)))
+            points = _hull_points(masks, turned.at(list(views)))
         except OptionError:
             pass  # from one direction, or they do not belong together: what is left tells more
     if points is None and scene.points is not None:
         points, told_by, trimmed = scene.points.positions @ turn.T, "sparse points", QUANTILES
-        points = points[project(turned, points)[2].mean(0) >= SHARED]
+        points = points[project(turned, torch.from_numpy(points)[None]).visible[0].double().mean(0) >= SHARED]
     if points is not None and len(points) >= LEAST_POINTS:
         placement = _around(points, trimmed, turn, told_by)
         return _as_trained(scene, placement) or placement
@@ -134,8 +135,8 @@ def in_model_frame(cameras: CameraTensors, placement: Placement) -> CameraTensor
 
 def seen_from(scene: PosedImages, placement: Placement) -> tuple[np.ndarray, np.ndarray]:
     """How far in front of each camera the object is, in its own sizes, and whether its middle is in the picture."""
-    _, z, visible = project(in_model_frame(scene.cameras, placement), np.zeros((1, 3)))
-    return z[:, 0], visible[:, 0]
+    _, z, visible = project(in_model_frame(scene.cameras, placement), ORIGIN)
+    return z[0, :, 0].numpy(), visible[0, :, 0].numpy()
 
 
 def spread_views(scene: PosedImages, placement: Placement, usable: Sequence[int], count: int) -> list[int]:
@@ -147,7 +148,7 @@ def spread_views(scene: PosedImages, placement: Placement, usable: Sequence[int]
         usable: views to choose from, the first of which is taken first.
         count: how many at most.
     """
-    directions = camera_centers(scene.cameras) - placement.center
+    directions = centers(scene.cameras).numpy() - placement.center
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     chosen, left = [usable[0]], list(usable[1:])
     while left and len(chosen) < count:
@@ -174,11 +175,11 @@ def frame_view(scene: PosedImages, view: int, placement: Placement, size: int, m
     image = scene.load(view)
     if mask is not None and not scene.cut_out:  # a cut-out photograph is before white already, with soft edges
         image = torch.where(mask, image, 1.0)
-    camera = stack([scene.camera(view)])
-    pixels, z, _ = project(in_model_frame(camera, placement), np.zeros((1, 3)))
-    (x, y), depth = pixels[0, 0], z[0, 0]
+    camera = scene.camera(view)
+    pixels, z, _ = project(in_model_frame(camera.at(None), placement), ORIGIN)
+    (x, y), depth = pixels[0, 0, 0].tolist(), float(z)
     rows, columns = image.shape[-2:]
-    sides = [max(1, round(FIELD * float(camera.intrinsics[0, axis, axis]) / depth)) for axis in (1, 0)]
+    sides = [max(1, round(FIELD * float(camera.intrinsics[axis, axis]) / depth)) for axis in (1, 0)]
     top, left = (round(middle - (side - 1) / 2) for middle, side in zip((y, x), sides, strict=True))
     height, width = sides
     ends = ((top, 0, rows), (left, 0, columns), (top + height, rows, rows), (left + width, columns, columns))
@@ -191,12 +192,7 @@ def frame_view(scene: PosedImages, view: int, placement: Placement, size: int, m
         parts.append(_cut(mask[None].float(), window, 0.0))
     image, inside, *masks = (resized(part, (size, size)) for part in parts)
     camera = resize(crop(camera, top, left, height, width), size, size)
-    return Framed(
-        image,
-        masks[0][0] > 0.5 if masks else None,
-        inside[0] > 0.5,
-        CameraTensors(*(torch.as_tensor(part)[0] for part in camera)),
-    )
+    return Framed(image, masks[0][0] > 0.5 if masks else None, inside[0] > 0.5, camera)
 
 
 def _cut(picture: Tensor, window: tuple[int, int, int, int], filling: float) -> Tensor:
@@ -210,7 +206,7 @@ def _hull_points(masks: Sequence[Tensor], cameras: CameraTensors) -> np.ndarray:
     """The corners (N, 3) of the voxels of a coarse hull."""
     sizes = [fitted(mask.shape, OUTLINE) for mask in masks]
     small = [resized(mask[None].float(), size)[0] > 0.5 for mask, size in zip(masks, sizes, strict=True)]
-    views = stack([resize(select(cameras, 0, view), *size) for view, size in enumerate(sizes)])
+    views = stack([resize(cameras.at(view), *size) for view, size in enumerate(sizes)])
     low, high = (np.array(corner) for corner in hull_box(small, views, margin=0.0))
     grid = VoxelGrid(COARSE, low.tolist(), high.tolist())
     # An object that is cut off by a picture's border goes on beyond it.
@@ -243,7 +239,7 @@ def _as_trained(scene: PosedImages, placement: Placement) -> Placement | None:
     if len(scene) < 2:
         return None
     focus = common_point(scene.cameras)
-    away = np.linalg.norm(camera_centers(scene.cameras) - focus, axis=1)
+    away = np.linalg.norm(centers(scene.cameras).numpy() - focus, axis=1)
     side = float(np.median(away)) / DISTANCE
     is_even = np.abs(away / side - DISTANCE).max() < EVEN * DISTANCE
     is_alike = ALIKE[0] < placement.side / side < ALIKE[1]
@@ -254,12 +250,12 @@ def _as_trained(scene: PosedImages, placement: Placement) -> Placement | None:
 
 def _looked_at(scene: PosedImages, turned: CameraTensors, turn: np.ndarray) -> Placement:
     """What the cameras look at, and what fills their pictures there."""
-    centers, focus = camera_centers(turned), common_point(turned)
+    origins, focus = centers(turned).numpy(), common_point(turned)
     K, size = turned.intrinsics.numpy(), np.stack([torch.as_tensor(part).numpy() for part in turned[2:]], -1)
-    away = np.einsum("vi,vi->v", turned.cam_from_world[:, 2, :3].numpy(), focus - centers)
+    away = project(turned, torch.from_numpy(focus)[None, None]).depth[0, :, 0].numpy()
     extents = away * np.minimum(size[:, 0] / K[:, 1, 1], size[:, 1] / K[:, 0, 0])
     side = float(np.median(extents)) / FIELD
-    spread = float(np.linalg.norm(centers - centers[0], axis=1).max())
+    spread = float(np.linalg.norm(origins - origins[0], axis=1).max())
     if len(scene) < 2 or not side > 0 or not spread > 1e-3 * np.median(away):
         raise OptionError("where the object is cannot be told: the cameras look at no common point; give box")
     return Placement(turn.T @ focus, side, turn, "the point that the cameras look at")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lsmgeo.cameras import centers
 from lsmgeo.data.meshes import Mesh
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def make_viewer(results: Results, cameras: CameraTensors) -> str:
     def placed(points: np.ndarray) -> np.ndarray:
         return (points - middle) @ turn.T / radius
 
-    centers = placed(-np.einsum("vji,vj->vi", E[:, :3, :3], E[:, :3, 3]))
+    origins = placed(centers(cameras).double().numpy())
     scene = trimesh.Scene()
     if surface is not None and len(surface.faces):
         thin = _thinned(surface)
@@ -73,14 +74,14 @@ def make_viewer(results: Results, cameras: CameraTensors) -> str:
         chosen = np.random.default_rng(0).permutation(len(points))[:MOST_POINTS]
         cloud = trimesh.PointCloud(placed(points[chosen]), colors=_opaque(results.colours[chosen]))
         scene.add_geometry(cloud, node_name="points", geom_name="points")
-    scene.add_geometry(_frusta(used, K, E, sizes, centers, turn), node_name="cameras", geom_name="cameras")
+    scene.add_geometry(_frusta(used, K, E, sizes, origins, turn), node_name="cameras", geom_name="cameras")
     # The script places the camera; without one trimesh would look for a place itself.
     scene.set_camera(angles=(0, 0, 0), distance=3, center=(0, 0, 0))
     stands = []
     for view in range(len(K)):
         axes = E[view, :3, :3] @ turn.T  # rows: right, down, forward
         halves = 0.5 * sizes[view] / (K[view, 1, 1], K[view, 0, 0])  # tangents of half the field, up and aside
-        stands.append(np.concatenate([centers[view], axes[2], -axes[1], halves]).round(6).tolist())
+        stands.append(np.concatenate([origins[view], axes[2], -axes[1], halves]).round(6).tolist())
     settings = {"first": used[0], "stands": stands, "shaded": surface is not None and surface.colours is None}
     script = files("lsmgeo.reconstruct").joinpath("viewer.js").read_text("utf-8")
     style = files("lsmgeo.reconstruct").joinpath("viewer.css").read_text("utf-8")
@@ -94,30 +95,30 @@ def _opaque(colours: np.ndarray) -> np.ndarray:
 
 
 def _frusta(
-    used: Sequence[int], K: np.ndarray, E: np.ndarray, sizes: np.ndarray, centers: np.ndarray, turn: np.ndarray
+    used: Sequence[int], K: np.ndarray, E: np.ndarray, sizes: np.ndarray, origins: np.ndarray, turn: np.ndarray
 ) -> Path3D:
     """Pyramids as lines, with a roof over the upper side of the picture."""
     from trimesh.path import Path3D
     from trimesh.path.entities import Line
 
     length = LONGEST_FRUSTUM
-    if len(centers) > 1:
+    if len(origins) > 1:
         from scipy.spatial import cKDTree
 
         # Cameras that turned in their place have no gap.
-        gaps = cKDTree(np.unique(centers.round(6), axis=0)).query(centers, k=2)[0].max(1)
+        gaps = cKDTree(np.unique(origins.round(6), axis=0)).query(origins, k=2)[0].max(1)
         length = float(np.clip(FRUSTUM_OF_GAP * np.median(gaps), 0.1, LONGEST_FRUSTUM))
     lines, colours = [], []
     # The first is drawn last: it is seen where another stands in its place.
-    for view in sorted(range(len(centers)), key=lambda view: view == used[0]):
-        (height, width), center = sizes[view], centers[view]
+    for view in sorted(range(len(origins)), key=lambda view: view == used[0]):
+        (height, width), origin = sizes[view], origins[view]
         left, right, top, bottom = -0.5, width - 0.5, -0.5, height - 0.5
         roof = top - 0.25 * height
         corners = [(left, top), (right, top), (right, bottom), (left, bottom)]
         corners += [(0.7 * left + 0.3 * right, top), ((left + right) / 2, roof), (0.3 * left + 0.7 * right, top)]
         rays = np.array([(x, y, 1) for x, y in corners]) @ np.linalg.inv(K[view]).T
         rays /= max(1.0, float(np.abs(rays[:4, :2]).max()))
-        nodes = np.concatenate([center[None], center + length * rays @ E[view, :3, :3] @ turn.T])
+        nodes = np.concatenate([origin[None], origin + length * rays @ E[view, :3, :3] @ turn.T])
         lines.append(nodes[EDGES])
         colour = REFERENCE if view == used[0] else USED if view in used else UNUSED
         colours.append(np.tile((*colour, 255), (len(EDGES), 1)))

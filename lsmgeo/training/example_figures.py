@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lsmgeo.cameras import CameraTensors, select
+from lsmgeo.cameras import CameraTensors, centers
 from lsmgeo.data import Sample
 from lsmgeo.drawing import Pixels, as_pixels, draw_depth, draw_voxels, tile
 
@@ -70,12 +70,11 @@ def _depth_rows(example: Example) -> list[list[Pixels | None]]:
         shown = torch.where(known, 0.15 + 0.85 * near, 1.0)
         rows.append([as_pixels(one.expand(3, *one.shape), SIZE) for one in shown])
     for depth in (predicted, sample.depth):
-        rows.append([draw_depth(one, select(sample.cameras, 0, view), size=SIZE) for view, one in enumerate(depth)])
+        rows.append([draw_depth(one, sample.cameras.at(view), size=SIZE) for view, one in enumerate(depth)])
     return rows
 
 
 def _azimuth(cameras: CameraTensors) -> float:
     """From which side the first camera looks at the origin, in degrees."""
-    pose = cameras.cam_from_world[0].double().cpu()
-    center = -pose[:3, :3].T.mv(pose[:3, 3])
-    return float(torch.rad2deg(torch.atan2(center[2], center[0])))
+    x, _, z = centers(cameras.at(0)).double().cpu()
+    return float(torch.rad2deg(torch.atan2(z, x)))

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from lsmgeo.cameras import CameraTensors
@@ -126,7 +125,7 @@ def _sample(batch: Batch, index: int) -> Sample:
 
     def pick(field: Any) -> Any:
         if isinstance(field, CameraTensors):
-            return CameraTensors(*(torch.as_tensor(value)[index].cpu() for value in field))
+            return field.at(index).to("cpu")
         return field[index].cpu() if isinstance(field, Tensor) else field and field[index]
 
     return Sample(*map(pick, batch[:-1]))

@@ -158,7 +158,7 @@ class SyntheticSet:
         chosen = list(range(self.pool) if views is None else views)
         draw = make_background(background)
         behind = [draw(generator, self.size, self.size) for _ in chosen]
-        cameras = CameraTensors(*(torch.as_tensor(values)[chosen] for values in spec.cameras))
+        cameras = spec.cameras.at(chosen)
         spec = spec._replace(cameras=cameras, model_cameras=cameras, backgrounds=torch.from_numpy(np.stack(behind)))
         return _single(render_shapes([spec], depth=depth)[0]) if self.is_rendered else spec
 

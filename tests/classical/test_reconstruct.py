@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from lsmgeo import data
-from lsmgeo.cameras import CameraTensors
+from lsmgeo.cameras import CameraTensors, project
 from lsmgeo.classical import default_depth_range, reconstruct_scene, reconstruct_view, select_neighbours
-from lsmgeo.classical.views import project
 from lsmgeo.errors import OptionError
 from tests.data.writers import make_scene, write_colmap, write_middlebury
 
@@ -163,8 +162,9 @@ def test_what_lies_on_the_border_of_a_picture_is_seen_where_the_picture_begins()
     """Pixels -0.5 belong to a picture of 8 x 6, pixels 7.5 and 5.5 no longer do, as for the operators."""
     camera = CameraTensors(torch.eye(3).double()[None], torch.eye(4).double()[None], 6, 8)
     x, y = np.array([(-0.5, 0), (0, -0.5), (7.4, 5.4), (7.5, 0), (0, 5.5), (-0.6, 0)]).T
-    pixels, depth, visible = project(camera, np.stack([2 * x, 2 * y, np.full(len(x), 2.0)], -1))
+    points = torch.from_numpy(np.stack([2 * x, 2 * y, np.full(len(x), 2.0)], -1))
+    pixels, depth, visible = (part[0] for part in project(camera, points[None]))
     np.testing.assert_allclose(pixels[0], np.stack([x, y], -1), rtol=1e-12)
     np.testing.assert_array_equal(depth, 2.0)
     assert visible.tolist() == [[True, True, True, False, False, False]]
-    assert not project(camera, np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]))[2].any()
+    assert not project(camera, torch.tensor([[[0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]])).visible.any()

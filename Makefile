@@ -56,7 +56,7 @@ $(VENV)/.dev: $(SOURCES) | $(BIN)/python
 
 setup: $(VENV)/.dev ## make the environment, with everything for tests and docs
 
-demo: $(VENV)/.core ## run the main job on an analytic scene; pictures go to demo/
+demo: $(VENV)/.core ## run the main job on an analytic scene; images go to demo/
 	$(BIN)/lsmgeo demo --out demo
 
 # One thread a process: two workers of two threads each run slower than two of one.
@@ -69,7 +69,7 @@ test: $(VENV)/.dev ## whole suite, doctests, and the core's coverage
 	@echo 'lines of the core:'
 	@$(BIN)/coverage report --include='$(CORE)' --omit='$(DEVICE_CODE)' --fail-under=$(CORE_COVERAGE)
 
-# An environment of the lowest versions that setup.cfg admits, of PyTorch, kornia and NumPy alone.
+# An environment of the lowest versions that setup.cfg admits, with only PyTorch, kornia and NumPy.
 # They have no wheels for Python 3.13.
 FLOORS := $(VENV)-floors
 FLOORS_PYTHON ?= $(shell for p in $(BIN)/python python3.11 python3.12 python3; do \
@@ -84,7 +84,7 @@ $(FLOORS)/.made: setup.cfg | $(BIN)/python
 # The operators as in somebody's own environment: lsmgeo without its other dependencies, without the C++ kernels (no
 # compiler is found) and without Triton. The checkout is out of sight, so that what is installed is what is tested.
 CORE_MODULES := $(addprefix lsmgeo.,cameras kernels grids functional layers fusion rays)
-test-floors: $(FLOORS)/.made ## the operators' tests at the lowest versions, installed beside PyTorch, kornia and NumPy alone
+test-floors: $(FLOORS)/.made ## the operators' tests at the lowest versions, with only PyTorch, kornia and NumPy beside it
 	@rm -rf build/lib* build/floors && mkdir -p build/floors && ln -s ../../tests ../../setup.cfg build/floors
 	CC=false CXX=false $(FLOORS)/bin/python -m pip install --quiet --no-deps --force-reinstall .
 	cd build/floors && LSMGEO_NATIVE=0 LSMGEO_TEST_WITHOUT_TRITON=1 HYPOTHESIS_PROFILE=dev OMP_NUM_THREADS=1 \

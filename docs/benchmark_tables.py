@@ -66,7 +66,7 @@ class Benchmark(SphinxDirective):
 
 
 def forget_plots(app: Sphinx) -> None:
-    """Remove plots that are older than what they show: the plot directive looks at the age of the script alone."""
+    """Remove plots that are older than what they show: the plot directive looks only at the age of the script."""
     shown = {name: [RESULTS / f"{drawn}.json"] for name, drawn in PLOTS.items()} | {"networks": SOURCES}
     for name, files in shown.items():
         newest = max((file.stat().st_mtime for file in files if file.is_file()), default=0.0)

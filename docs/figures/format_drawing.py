@@ -34,7 +34,7 @@ def panel(figure: Figure, left: float, bottom: float, scale: float, limits: tupl
         bottom: inches from its bottom.
         scale: inches of one unit.
         limits: least and largest x, and the y at the bottom and at the top.
-        title: stands above it.
+        title: above it.
     """
     first, last, low, high = limits
     width, height = figure.get_size_inches()
@@ -80,7 +80,7 @@ def draw_camera(axes: Axes, directions: tuple[str, str, str], *, letters: str = 
     for corner in plane:
         axes.plot(*np.stack((center, corner)).T, color=SHADE, lw=0.8)
     axes.plot(*center, "o", color=INK, ms=5, zorder=6)
-    # The picture's own corner: rows run down the picture whatever the camera's y does.
+    # The image's own corner: rows run down the image whatever the camera's y does.
     axes.plot(*plane[0], "s", color=INK, ms=4.5, zorder=6)
     write(axes, plane[0], "pixel (0, 0)", by=(-0.05, 0.09), fontsize=7.5, va="bottom")
     for letter, name in zip(letters, directions, strict=True):
@@ -108,7 +108,7 @@ def draw_direction(axes: Axes, label: str, *, to_camera: bool, colour: str) -> N
 
 
 def draw_pixels(axes: Axes, center: float, colour: str) -> None:
-    """The picture's first pixels, with the coordinates of the first one's centre."""
+    """The image's first pixels, with the coordinates of the first one's centre."""
     for row in range(2):
         for column in range(3):
             square = plt.Rectangle(

@@ -1,4 +1,4 @@
-"""A drawn scene with a box and a ball, cameras that see it, and the same cameras with usual mistakes."""
+"""A rendered scene with a box and a ball, cameras that see it, and the same cameras with usual mistakes."""
 
 import torch
 from torch import Tensor
@@ -15,12 +15,12 @@ HALF_A_PIXEL = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
 
 
 def see() -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Pictures (V, H, W, 3), depth (V, H, W), K (V, 3, 3) and world-to-camera matrices (V, 4, 4) of three views."""
+    """Images (V, H, W, 3), depth (V, H, W), K (V, 3, 3) and world-to-camera matrices (V, 4, 4) of three views."""
 
     def paint(first: tuple[float, float, float], second: tuple[float, float, float], texture: str) -> scenes.Material:
         return scenes.Material(first, texture=texture, second=second, frequency=5.0)
 
-    solids = [
+    primitives = [
         scenes.half_space((0, -0.45, 0), (0, 1, 0), paint((0.87, 0.85, 0.8), (0.68, 0.69, 0.7), "checker")),
         scenes.box(BOX, SIZE, paint((0.65, 0.72, 0.8), (0.42, 0.52, 0.65), "stripes")),
         scenes.sphere(BALL, RADIUS, paint((0.85, 0.72, 0.55), (0.7, 0.5, 0.35), "waves")),
@@ -29,8 +29,8 @@ def see() -> tuple[Tensor, Tensor, Tensor, Tensor]:
     azimuths = torch.tensor([10.0, 38.0, -25.0])
     views = cameras.orbit(azimuths, 24.0, 2.2, focal_length=FOCAL, height=HEIGHT, width=WIDTH)
     views = cameras.to(views, torch.float64)
-    picture = scenes.render([scenes.Scene(solids)], type(views)(*(value[None] for value in views)), sun)
-    return picture.images[0].movedim(1, -1), picture.depth[0].double(), views.intrinsics, views.cam_from_world
+    rendered = scenes.render([scenes.Scene(primitives)], type(views)(*(value[None] for value in views)), sun)
+    return rendered.images[0].movedim(1, -1), rendered.depth[0].double(), views.intrinsics, views.cam_from_world
 
 
 def mistakes(K: Tensor, E: Tensor) -> dict[str, tuple[Tensor, Tensor]]:

@@ -13,11 +13,11 @@ from network_tracing import Stage, traced
 # Parts of a model: what they are called, their colour, and the row that they are drawn in.
 PARTS = {
     "images": ("images", "0.75", 0),
-    "image_encoder": ("image encoder, each image alone", "#8fb8de", 0),
-    "encoder": ("image encoder, each image alone", "#8fb8de", 0),
-    "vector": ("image encoder, each image alone", "#8fb8de", 0),
+    "image_encoder": ("image encoder, each image by itself", "#8fb8de", 0),
+    "encoder": ("image encoder, each image by itself", "#8fb8de", 0),
+    "vector": ("image encoder, each image by itself", "#8fb8de", 0),
     "cameras": ("cameras", "0.75", 1),
-    "rotation": ("pose, each camera alone", "#c9b38c", 1),
+    "rotation": ("pose, each camera by itself", "#c9b38c", 1),
     "unproject": ("unprojection", "#f2a65a", 0),
     "fusion": ("fusion", "#8cc084", 1),
     "recurrence": ("fusion", "#8cc084", 1),

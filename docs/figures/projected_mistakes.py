@@ -1,4 +1,4 @@
-"""What usual mistakes do to a known object that is drawn into a picture: a box and a ball, right and wrong."""
+"""What usual mistakes do to a known object that is drawn into an image: a box and a ball, right and wrong."""
 
 import itertools
 
@@ -22,7 +22,7 @@ rings = [circle.roll(axis, -1) + torch.tensor(BALL) for axis in range(3)]
 images, _, K, E = see()
 figure, axes = plt.subplots(2, 4, figsize=(9.6, 4.2), layout="constrained")
 axes[0, 0].imshow(images[1])
-axes[0, 0].set_title("picture", fontsize=9.5, color=INK)
+axes[0, 0].set_title("image", fontsize=9.5, color=INK)
 for axis, (name, (intrinsics, poses)) in zip(axes.flat[1:], mistakes(K, E).items(), strict=True):
     axis.imshow(images[1], alpha=0.55)
     where = "all of it behind the camera"
@@ -31,7 +31,7 @@ for axis, (name, (intrinsics, poses)) in zip(axes.flat[1:], mistakes(K, E).items
         front = depth > 0
         inside = front & (pixels > 0).all(-1) & (pixels < torch.tensor([WIDTH, HEIGHT])).all(-1)
         if bool(front.any()):
-            where = "" if bool(inside.any()) or not where else "all of it outside the picture"
+            where = "" if bool(inside.any()) or not where else "all of it outside the image"
             axis.plot(*pixels[front].T, color=OTHER, lw=1.3)
     axis.text(WIDTH / 2, 25, where, color=OTHER, fontsize=9.5, ha="center")
     axis.set_title(name, fontsize=9.5, color=INK)

@@ -12,16 +12,9 @@ from torch import Tensor
 
 from lsmgeo._checks import check_devices, check_float, check_mask, check_size, describe
 from lsmgeo._linalg import affine_inverse, multiply
+from lsmgeo.cameras.camera_checks import check_cameras, common_size, views_of, views_per_scene
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
-from lsmgeo.cameras.tensors import (
-    Cameras,
-    CameraTensors,
-    as_tensors,
-    check_cameras,
-    common_size,
-    views_of,
-    views_per_scene,
-)
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors
 from lsmgeo.errors import DTypeError, ShapeError
 from lsmgeo.grids import FrustumGrid, Lattice, VoxelGrid, check_depths
 from lsmgeo.kernels.request import Options, Sites

@@ -177,10 +177,8 @@ def draw_depth(
     is_whole = np.logical_and.reduce([known[end] for end in ends])
     is_whole &= np.linalg.norm(corners - np.roll(corners, 1, 2), axis=-1).max(-1) < STEEPEST * pixel
     quads = corners[is_whole]  # (Q, 4, 3)
-    view = (
-        Rotation.from_euler("yx", (turn, lift), degrees=True).as_matrix()
-        @ camera.cam_from_world[:3, :3].double().cpu().numpy()
-    )
+    R = camera.cam_from_world[:3, :3].double().cpu().numpy()
+    view = Rotation.from_euler("yx", (turn, lift), degrees=True).as_matrix() @ R
     normals = np.cross(quads[:, 3] - quads[:, 0], quads[:, 1] - quads[:, 2])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     normals *= -np.sign(normals @ view[2])[:, None]  # towards the viewer

@@ -27,8 +27,9 @@ from lsmgeo._checks import (
 )
 from lsmgeo._linalg import affine_inverse, basis_row, homogeneous_row, inverse_3x3, multiply
 from lsmgeo._torch_compat import is_exporting
+from lsmgeo.cameras.camera_checks import check_cameras, common_size
 from lsmgeo.cameras.matrices import camera_matrices
-from lsmgeo.cameras.tensors import Cameras, as_tensors, check_cameras, common_size
+from lsmgeo.cameras.tensors import Cameras, as_tensors
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import DTypeError, GridError, ShapeError
 
@@ -246,7 +247,7 @@ class FrustumGrid:
         """Check and normalise the fields."""
         who = "FrustumGrid"
         camera = as_tensors(self.camera, who)
-        leading = tuple(camera.cam_from_world.shape[:-2])
+        leading = camera.shape
         if len(leading) > 1:
             raise ShapeError(
                 f"{who}: camera must have leading shape () or (B,), one a scene (see cameras.select); got {leading}"

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from lsmgeo._checks import check_broadcast, check_choice, check_devices, check_flag, check_geometry, check_size
 from lsmgeo._linalg import homogeneous_row, multiply, transform
-from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, check_cameras, image_sizes
+from lsmgeo.cameras.camera_checks import check_cameras
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, ShapeError
 

@@ -25,9 +25,21 @@ class CameraMatrices(NamedTuple):
         """P = K [R|t], (..., 3, 4): pixel from world."""
         return multiply(self.intrinsics, torch.cat((self.rotation, self.translation[..., None]), -1))
 
+    def homogeneous_pixels(self, points: Tensor) -> Tensor:
+        """``depth (u, v, 1) = K (R X + t)`` of points (..., N, 3) in float64, (..., N, 3)."""
+        P = self.projection()[..., None, :, :]
+        x, y, z = points[..., None].unbind(-2)  # (..., N, 1)
+        return P[..., 0] * x + P[..., 1] * y + P[..., 2] * z + P[..., 3]
+
     def world_from_pixel(self) -> Tensor:
         """R^T K^-1, (..., 3, 3): applied to (u, v, 1), the step along a pixel's ray that advances camera z by 1."""
         return multiply(self.rotation.transpose(-1, -2), inverse_3x3(self.intrinsics))
+
+    def pixel_steps(self, height: int, width: int) -> Tensor:
+        """``R^T K^-1 (u, v, 1)`` of all pixels, (..., height, width, 3)."""
+        M = self.world_from_pixel()[..., None, None, :, :]
+        u, v = (torch.arange(n, dtype=M.dtype, device=M.device)[:, None] for n in (width, height))
+        return M[..., 0] * u + M[..., 1] * v[:, None] + (M[..., 2] + 0.0)  # + 0.0: no negative zeros
 
     def world_from_frustum(self) -> Tensor:
         """T, (..., 4, 4), with ``X ~ T (u, v, 1/depth, 1)``; column three is the camera centre."""

@@ -12,16 +12,9 @@ from torch import Tensor
 
 from lsmgeo._checks import check_devices, check_geometry, check_number, check_size
 from lsmgeo._dtypes import saturating_cast
-from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
-from lsmgeo.cameras.tensors import (
-    Cameras,
-    as_tensors,
-    check_cameras,
-    common_size,
-    image_sizes,
-    views_of,
-    views_per_scene,
-)
+from lsmgeo.cameras.camera_checks import check_cameras, common_size, views_of, views_per_scene
+from lsmgeo.cameras.matrices import camera_matrices
+from lsmgeo.cameras.tensors import Cameras, as_tensors, image_sizes
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import GridError, ShapeError
 
@@ -77,9 +70,7 @@ def project(cameras: Cameras, points: Tensor, *, near: float = 1e-6) -> Projecte
     check_devices(who, cameras=tensors.intrinsics, points=points)
     check_cameras(who, tensors)
     _check_finite(who, "points", points)
-    P = camera_matrices(tensors).projection()[:, :, None]  # (B, V, 1, 3, 4)
-    x, y, z = points.double()[:, None, :, :, None].unbind(-2)  # (B, 1, N, 1)
-    homogeneous = P[..., 0] * x + P[..., 1] * y + P[..., 2] * z + P[..., 3]  # (B, V, N, 3)
+    homogeneous = camera_matrices(tensors).homogeneous_pixels(points.double()[:, None])  # (B, V, N, 3)
     distance = homogeneous[..., 2]
     depth = saturating_cast(distance, points.dtype)
     front = depth > near
@@ -128,9 +119,8 @@ def unproject_depth(cameras: Cameras, depth: Tensor) -> Tensor:
     check_cameras(who, tensors)
     _check_finite(who, "depth", depth)
     matrices = camera_matrices(tensors, (height, width))
-    points = (matrices.center + 0.0)[:, :, None, None] + depth.double()[..., None] * _pixel_steps(
-        matrices, height, width
-    )
+    steps = matrices.pixel_steps(height, width)
+    points = (matrices.center + 0.0)[:, :, None, None] + depth.double()[..., None] * steps
     return saturating_cast(points, depth.dtype)
 
 
@@ -189,16 +179,9 @@ def rays(cameras: Cameras, size: tuple[int, int] | None = None) -> tuple[Tensor,
     else:
         height, width = check_size(who, "size", size, 2, "(h, w)")
     matrices = camera_matrices(tensors, (height, width))
-    steps = _pixel_steps(matrices, height, width)
+    steps = matrices.pixel_steps(height, width)
     directions = steps / torch.linalg.vector_norm(steps, dim=-1, keepdim=True)
     return (matrices.center + 0.0).to(tensors.dtype), directions.to(tensors.dtype)
-
-
-def _pixel_steps(matrices: CameraMatrices, height: int, width: int) -> Tensor:
-    """``R^T K^-1 (u, v, 1)``, (..., h, w, 3): the step along each pixel's ray that advances camera z by 1."""
-    M = matrices.world_from_pixel()[..., None, None, :, :]
-    u, v = (torch.arange(n, dtype=M.dtype, device=M.device)[:, None] for n in (width, height))
-    return M[..., 0] * u + M[..., 1] * v[:, None] + (M[..., 2] + 0.0)  # + 0.0: no negative zeros
 
 
 def _check_finite(who: str, name: str, value: Tensor) -> None:

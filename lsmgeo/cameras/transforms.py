@@ -18,8 +18,9 @@ from lsmgeo._checks import (
     describe,
 )
 from lsmgeo._linalg import cross, homogeneous_row, multiply, transform
+from lsmgeo.cameras.camera_checks import check_cameras
 from lsmgeo.cameras.matrices import resize_matrix
-from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, check_cameras, image_sizes
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, DeviceError, DTypeError, OptionError, ShapeError
 

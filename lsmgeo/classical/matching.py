@@ -113,10 +113,9 @@ def warp_neighbours(
     check_finite(who, "images", images)
     check_float(who, "depths", depths, "(P,)", rank=1)
     tensors = as_tensors(cameras, who)
-    if tuple(tensors.cam_from_world.shape[:-2]) != (len(images),):
+    if tensors.shape != (len(images),):
         raise ShapeError(
-            f"{who}: cameras must have the images' leading shape (V,) = ({len(images)},); "
-            f"got {tuple(tensors.cam_from_world.shape[:-2])}"
+            f"{who}: cameras must have the images' leading shape (V,) = ({len(images)},); got {tensors.shape}"
         )
     if options.score in ("zncc", "census"):
         images = luminance(images)

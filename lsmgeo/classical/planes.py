@@ -73,10 +73,7 @@ def longest_path(cameras: Cameras, near: float, far: float) -> float:
     """
     tensors = as_tensors(cameras, "longest_path")
     if tensors.cam_from_world.dim() != 3 or len(tensors.cam_from_world) < 2:
-        raise ShapeError(
-            f"longest_path: cameras must have leading shape (V,), V at least 2; "
-            f"got {tuple(tensors.cam_from_world.shape[:-2])}"
-        )
+        raise ShapeError(f"longest_path: cameras must have leading shape (V,), V at least 2; got {tensors.shape}")
     # The only pixel of a map of one is at the centre of the image.
     depth = torch.tensor([near, far], dtype=torch.float64).reshape(1, 2, 1, 1)
     ends = unproject_depth(tensors.at([0, 0]), depth).reshape(1, 2, 3)

@@ -92,9 +92,7 @@ def fuse_depth(
     _check_grid(who, grid)
     tensors = as_tensors(cameras, who)
     if tensors.intrinsics.dim() != 3 or not len(tensors.intrinsics):
-        raise ShapeError(
-            f"{who}: cameras must have the leading shape (V,), V at least 1; got {tuple(tensors.intrinsics.shape[:-2])}"
-        )
+        raise ShapeError(f"{who}: cameras must have the leading shape (V,), V at least 1; got {tensors.shape}")
     views = len(tensors.intrinsics)
     truncation = TRUNCATION * voxel_side(grid) if truncation is None else truncation
     check_positive(who, "truncation", truncation)

@@ -103,7 +103,7 @@ def visual_hull(
     has_batch = isinstance(masks, Tensor) and masks.dim() == 4
     maps = _maps_of_views(who, masks)
     tensors = as_tensors(cameras, who)
-    leading = tuple(tensors.intrinsics.shape[:-2])
+    leading = tensors.shape
     expected = (len(maps[0]), len(maps)) if has_batch else (len(maps),)
     if leading != expected:
         raise ShapeError(f"{who}: cameras must have the leading shape {expected}, as masks; got {leading}")
@@ -183,7 +183,7 @@ def hull_box(
     who = "hull_box"
     tensors = as_tensors(cameras, who)
     check_number(who, "margin", margin, "a number, 0 at least", 0)
-    leading = tuple(tensors.intrinsics.shape[:-2])
+    leading = tensors.shape
     if len(leading) != 1:
         raise ShapeError(f"{who}: cameras must have the leading shape (V,); got {leading}")
     if not isinstance(masks, (Tensor, Sequence)) or isinstance(masks, str):

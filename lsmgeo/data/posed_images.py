@@ -109,7 +109,7 @@ class PosedImages:
 
     def size(self, view: int) -> tuple[int, int]:
         """(height, width) of one image in pixels."""
-        height, width = (int(torch.as_tensor(size)[view]) for size in self.cameras[2:])
+        height, width = (int(size) for size in self.camera(view)[2:])
         return height, width
 
     def load(self, view: int) -> torch.Tensor:
@@ -193,7 +193,7 @@ class PosedImages:
                 "choose views of one size, or load them one by one"
             )
         images = torch.stack([self.load(view) for view in chosen])
-        cameras = type(self.cameras)(*(torch.as_tensor(value)[chosen] for value in self.cameras))
+        cameras = self.cameras.at(chosen)
         maps = [depth for view in chosen if (depth := self.load_depth(view)) is not None]
         depth = torch.stack(maps) if len(maps) == len(chosen) else None
         masks = [mask for view in chosen if (mask := self.load_mask(view)) is not None]

@@ -135,9 +135,7 @@ def check_sample(sample: Sample, who: str = "sample") -> CameraTensors:
         raise ShapeError(f"{who}: images must be (V, 3, H, W) with V, H, W >= 1; got {tuple(sample.images.shape)}")
     cameras = as_tensors(sample.cameras, who)
     if tuple(cameras.cam_from_world.shape) != (views, 4, 4):
-        raise ShapeError(
-            f"{who}: cameras must have leading shape (V,) = ({views},); got {tuple(cameras.cam_from_world.shape[:-2])}"
-        )
+        raise ShapeError(f"{who}: cameras must have leading shape (V,) = ({views},); got {cameras.shape}")
     sizes = torch.stack([torch.as_tensor(cameras.height), torch.as_tensor(cameras.width)], -1)
     if can_inspect(sizes) and not bool((sizes == sizes.new_tensor([height, width])).all()):
         other = next(tuple(size) for size in sizes.tolist() if tuple(size) != (height, width))

@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from lsmgeo._checks import check_flag
-from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes, views_of, views_per_scene
+from lsmgeo.cameras.camera_checks import views_of, views_per_scene
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid, depth_planes
 from lsmgeo.layers import PlaneSweepProject

@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from torch.nn.functional import leaky_relu
 
 from lsmgeo._checks import check_devices, check_float, check_mask
-from lsmgeo.cameras.tensors import Cameras, as_tensors, check_cameras, views_of
+from lsmgeo.cameras.camera_checks import check_cameras, views_of
+from lsmgeo.cameras.tensors import Cameras, as_tensors
 from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.grids import VoxelGrid
 from lsmgeo.models.blocks import VoxelModel, interleave

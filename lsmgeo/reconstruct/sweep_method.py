@@ -59,7 +59,7 @@ def readable(scene: PosedImages) -> tuple[PosedImages, tuple[str, ...]]:
         scene,
         names=tuple(scene.names[view] for view in kept),
         paths=tuple(scene.paths[view] for view in kept),
-        cameras=type(scene.cameras)(*(torch.as_tensor(part)[kept] for part in scene.cameras)),
+        cameras=scene.cameras.at(kept),
         points=points,
         lenses=None if scene.lenses is None else tuple(scene.lenses[view] for view in kept),
         depths=None if scene.depths is None else tuple(scene.depths[view] for view in kept),

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from lsmgeo._checks import check_devices, check_geometry, check_positive, check_size
 from lsmgeo.cameras import as_tensors
+from lsmgeo.cameras.camera_checks import check_cameras, common_size
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
-from lsmgeo.cameras.tensors import Cameras, check_cameras, common_size
+from lsmgeo.cameras.tensors import Cameras
 from lsmgeo.errors import DTypeError, ShapeError
 from lsmgeo.scenes.inputs import behind, checked_lights
 from lsmgeo.scenes.lighting import Lights, shade
@@ -104,8 +105,7 @@ def render(
     tensors = as_tensors(cameras, who)
     if tensors.intrinsics.dim() != 4 or len(tensors.intrinsics) != len(scenes):
         raise ShapeError(
-            f"{who}: cameras must have the leading shape (S, V) with S = {len(scenes)} scenes; "
-            f"got {tuple(tensors.intrinsics.shape[:-2])}"
+            f"{who}: cameras must have the leading shape (S, V) with S = {len(scenes)} scenes; got {tensors.shape}"
         )
     if tensors.intrinsics.shape[1] == 0:
         raise ShapeError(f"{who}: cameras must have one view at least; got V = 0")

@@ -151,10 +151,9 @@ def _windows(
     """First and last + 1 row and column of the pixels that can show a solid, from the corners of its box."""
     corners = torch.cartesian_prod(*[rows.new_tensor([-1.0, 1.0], dtype=torch.float64)] * 3)  # (8, 3)
     world = transform(solids.axes[rows, None], corners) + solids.center[rows, None]  # (P, 8, 3)
-    rotation, center = cameras.rotation[views, None], cameras.center[views, None]
-    seen = transform(rotation, world - center)
-    depth = seen[..., 2]
-    pixel = transform(cameras.intrinsics[views, None], seen)[..., :2] / depth.clamp_min(near)[..., None]
+    homogeneous = CameraMatrices(*(value[views] for value in cameras)).homogeneous_pixels(world)
+    depth = homogeneous[..., 2]
+    pixel = homogeneous[..., :2] / depth.clamp_min(near)[..., None]
     limit = pixel.new_tensor([size[1], size[0]])
     # One pixel of margin for rounding; what reaches behind the near plane may be anywhere.
     first = (pixel.amin(1).floor() - 1).clamp_min(0).minimum(limit)

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from lsmgeo._checks import check_choice, check_flag, check_number, check_size
 from lsmgeo.cameras import as_tensors
+from lsmgeo.cameras.camera_checks import check_cameras, common_size
 from lsmgeo.cameras.matrices import camera_matrices
-from lsmgeo.cameras.tensors import Cameras, check_cameras, common_size
+from lsmgeo.cameras.tensors import Cameras
 from lsmgeo.data.meshes import DEFAULT_COLOUR, Mesh, check_mesh
 from lsmgeo.data.meshes.mesh_topology import corner_normals, face_normals
 from lsmgeo.errors import BackendError, ShapeError
@@ -94,7 +95,7 @@ def render_mesh(
     check_number(who, "crease", crease, "degrees, 0 to 180", 0, 180)
     tensors = as_tensors(cameras, who)
     if tensors.intrinsics.dim() != 3:
-        raise ShapeError(f"{who}: cameras must have the leading shape (V,); got {tuple(tensors.intrinsics.shape[:-2])}")
+        raise ShapeError(f"{who}: cameras must have the leading shape (V,); got {tensors.shape}")
     check_cameras(who, tensors)
     size = common_size(who, tensors) if size is None else check_size(who, "size", size, 2, "(h, w)")  # type: ignore[assignment]
     assert size is not None
@@ -102,7 +103,8 @@ def render_mesh(
     matrices = camera_matrices(tensors, size)
     centers = matrices.center.numpy(force=True)
     from_pixel = matrices.world_from_pixel().numpy(force=True)
-    projections = matrices.projection().numpy(force=True)
+    box = torch.cartesian_prod(*torch.from_numpy(mesh.bounds).to(tensors.device, torch.float64).unbind(1))
+    corners_seen = matrices.homogeneous_pixels(box).numpy(force=True)  # (V, 8, 3)
 
     images = behind(who, background, (len(centers), 3, *size), torch.device("cpu"), torch.float32)
     depth, mask = torch.zeros(len(centers), *size), torch.zeros(len(centers), *size, dtype=torch.bool)
@@ -111,7 +113,7 @@ def render_mesh(
     corners = corner_normals(mesh.vertices, mesh.faces, float(crease)) if smooth else None
     surface = _Surface(mesh, flat, corners, backend)
     for view in range(len(centers)):
-        pixels = _pixels_near(mesh, projections[view], size)
+        pixels = _pixels_near(corners_seen[view], size)
         for begin in range(0, len(pixels), RAYS_AT_ONCE):
             some = pixels[begin : begin + RAYS_AT_ONCE]
             # Camera z of these directions is 1, so a distance along them is a depth.
@@ -121,11 +123,12 @@ def render_mesh(
     return out
 
 
-def _pixels_near(mesh: Mesh, projection: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Which pixels may see the mesh, row by row: those in the window of its bounding box, if all of it is in front."""
-    box = mesh.bounds
-    corners = np.array([[*(box[(k >> axis) & 1, axis] for axis in range(3)), 1.0] for k in range(8)])
-    x, y, z = (corners @ projection.T).T
+def _pixels_near(corners: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Which pixels may see the mesh, row by row: those in the window of its bounding box, if all of it is in front.
+
+    The box is given by the homogeneous pixels (8, 3) of its corners.
+    """
+    x, y, z = corners.T
     low, high = np.zeros(2, np.int64), np.array(size)
     if z.min() > 1e-6 * np.abs(z).max():
         v, u = y / z, x / z

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from lsmgeo._checks import check_number, check_whole, describe
-from lsmgeo.cameras.tensors import check_cameras
+from lsmgeo.cameras.camera_checks import check_cameras
 from lsmgeo.data.images import encode_png
 from lsmgeo.data.sample import MAX_VIEWS, Sample, check_sample
 from lsmgeo.data.shards.shard_metadata import MAX_SIDE, MAX_VOXELS, is_text

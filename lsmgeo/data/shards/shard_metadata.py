@@ -10,7 +10,7 @@ import torch
 
 from lsmgeo._checks import check_whole, describe
 from lsmgeo.cameras import CameraTensors
-from lsmgeo.cameras.tensors import check_cameras
+from lsmgeo.cameras.camera_checks import check_cameras
 from lsmgeo.data.json_files import read_array
 from lsmgeo.data.sample import MAX_VIEWS
 from lsmgeo.errors import DataError, LsmGeoError

@@ -1,0 +1,114 @@
+"""Checks of cameras beside other arguments: their values, their one size, their scenes and views."""
+
+from __future__ import annotations
+
+from math import prod
+
+import torch
+from torch import Tensor
+
+from lsmgeo._linalg import multiply
+from lsmgeo.cameras.tensors import CameraTensors, image_sizes
+from lsmgeo.debugging import can_inspect
+from lsmgeo.errors import CameraError, ShapeError
+
+__all__ = ["check_cameras", "common_size", "views_of", "views_per_scene"]
+
+
+def check_cameras(who: str, cameras: CameraTensors, view_mask: Tensor | None = None) -> None:
+    """Raise a `CameraError` that names the first bad camera, if the values may be read (see `lsmgeo.debug`).
+
+    Checked: finite values; K with positive focal lengths, no vertical skew and last row (0, 0, 1); rigid, unmirrored
+    extrinsics (``max |R^T R - I| <= 1e-3``, det R > 0) with last row (0, 0, 0, 1); sizes of at least one pixel.
+
+    Args:
+        who: the function that asks.
+        cameras: from `as_tensors`.
+        view_mask: bool, of the cameras' leading shape; cameras where it is False are not looked at.
+    """
+    intrinsics, cam_from_world = cameras.intrinsics, cameras.cam_from_world
+    height, width = image_sizes(cameras)
+    if not can_inspect(intrinsics) or intrinsics.numel() == 0:
+        return
+    with torch.no_grad():
+        K, E = intrinsics.double(), cam_from_world.double()
+        R = E[..., :3, :3]
+        residual = (
+            (multiply(R.transpose(-1, -2), R) - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-1, -2))
+        )
+        triple = (R[..., 0, :] * torch.linalg.cross(R[..., 1, :], R[..., 2, :])).sum(-1)
+        focal = torch.minimum(K[..., 0, 0], K[..., 1, 1])
+        smallest = 1e-6 * torch.maximum(height, width)
+        last_k = (K[..., 2, :] - K.new_tensor([0.0, 0.0, 1.0])).abs().amax(-1)
+        last_e = (E[..., 3, :] - E.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax(-1)
+        rules = (
+            # Written so that a NaN breaks the rule that names it first.
+            ("intrinsics must be finite", K.isfinite().all(-1).all(-1), None),
+            ("cam_from_world must be finite", E.isfinite().all(-1).all(-1), None),
+            ("height and width must be at least 1 pixel", (height >= 1) & (width >= 1), None),
+            ("intrinsics must have the last row (0, 0, 1); its largest deviation is", last_k <= 1e-3, last_k),
+            ("focal lengths must be positive pixels, 1e-6 of the image size at least; got", focal > smallest, focal),
+            ("intrinsics[1, 0] must be 0; got", K[..., 1, 0].abs() <= 1e-6 * focal, K[..., 1, 0]),
+            ("cam_from_world must have the last row (0, 0, 0, 1); its largest deviation is", last_e <= 1e-3, last_e),
+            ("the rotation must be orthonormal (a scale in it?); max |R^T R - I| is", residual <= 1e-3, residual),
+            ("the rotation must not mirror (is an axis flipped?); its determinant is", triple > 0, triple),
+        )
+        good = torch.stack([rule for _, rule, _ in rules])
+        if view_mask is not None:
+            good = good | ~view_mask
+        if bool(good.all()):
+            return
+        for (text, _, value), passed in zip(rules, good, strict=True):
+            if not bool(passed.all()):
+                index = tuple((~passed).nonzero()[0].tolist())
+                came = "" if value is None else f" {value[index].item():.6g}"
+                raise CameraError(f"{who}: cameras{list(index) if index else ''}: {text}{came}")
+
+
+def common_size(who: str, cameras: CameraTensors) -> tuple[int, int]:
+    """The one image size (height, width) of all cameras; an error where they differ or where values cannot be read."""
+    if torch.compiler.is_compiling():
+        raise CameraError(f"{who}: size must be given under torch.compile and torch.export; got None")
+    heights, widths = (size.unique().tolist() for size in image_sizes(cameras))
+    if len(heights) != 1 or len(widths) != 1:
+        raise CameraError(
+            f"{who}: size must be given where views differ in size; got heights {heights}, widths {widths}"
+        )
+    if heights[0] != int(heights[0]) or widths[0] != int(widths[0]):
+        raise CameraError(f"{who}: size must be given where the cameras' is fractional; got {heights[0]} x {widths[0]}")
+    return int(heights[0]), int(widths[0])
+
+
+def views_per_scene(who: str, cameras: CameraTensors, scenes: int, whose: str) -> tuple[int, int]:
+    """(B, V) of cameras (B, V) or (B*V,) beside B scenes of another argument, which `whose` names in errors."""
+    leading = cameras.shape
+    if len(leading) == 2:
+        views = (leading[0], leading[1])
+        if leading[0] != scenes:
+            raise ShapeError(f"{who}: cameras must be (B, V) with the {whose} B = {scenes}; got {leading}")
+    else:
+        count = prod(leading)
+        # With no scene the number of views cannot be inferred, and 1 is as good as any.
+        if scenes == 0 and count == 0:
+            views = (0, 1)
+        elif scenes == 0 or count % scenes:
+            raise ShapeError(f"{who}: cameras must be B*V with the {whose} B = {scenes}; got {count}")
+        else:
+            views = (scenes, count // scenes)
+    if views[1] < 1:
+        raise ShapeError(f"{who}: cameras must hold at least one view a scene; got none")
+    return views
+
+
+def views_of(who: str, cameras: CameraTensors, views: tuple[int, int]) -> CameraTensors:
+    """Cameras (B, V) or (B*V,), view fastest, with leading shape (B, V)."""
+    leading = cameras.shape
+    if leading != views and leading != (views[0] * views[1],):
+        raise ShapeError(
+            f"{who}: cameras must have leading shape (B, V) = {views}, or (B*V,) with the view fastest; got {leading}"
+        )
+    if leading == views:
+        return cameras
+    height, width = (size.reshape(views) for size in image_sizes(cameras))
+    matrices = (cameras.intrinsics.reshape(*views, 3, 3), cameras.cam_from_world.reshape(*views, 4, 4))
+    return CameraTensors(*matrices, height, width)

@@ -255,16 +255,7 @@ def evaluation_mode(model: nn.Module) -> Iterator[None]:
 
 
 def shift_principal_point(who: str, cameras: Cameras, pixels: float) -> CameraTensors:
-    """Move the principal points of cameras.
-
-    Args:
-        who: the model, named in errors.
-        cameras: of any leading shape.
-        pixels: of the image, to the right and down.
-
-    Returns:
-        Cameras of the same leading shape.
-    """
+    """Cameras whose principal points are shifted by so many pixels, to the right and down."""
     tensors = as_tensors(cameras, who)
     offset = torch.zeros_like(tensors.intrinsics)
     offset[..., :2, 2] = pixels

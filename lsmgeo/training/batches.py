@@ -1,6 +1,6 @@
-"""Batches for training and for evaluation: from shards, or from synthetic shapes rendered on the device that trains.
+"""Batches for training and evaluation: from shards, or from synthetic shapes rendered on the device that trains.
 
-What a sample is depends on (seed, epoch, index) alone, never on workers or on what was read before.
+A sample is a function of (seed, epoch, index) only, not of workers or of what was read before.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = ["Need", "Shapes", "endless_order", "open_shapes", "training_batches",
 
 
 class Need(NamedTuple):
-    """What a model is trained with besides images and cameras."""
+    """What the training of a model needs besides images and cameras."""
 
     image_size: int
     voxels: int | None  # a side of the occupancy, or None
@@ -41,13 +41,13 @@ class Need(NamedTuple):
 
 @dataclass(frozen=True)
 class Shapes:
-    """One part of a set: a data set of (epoch, index), and what makes a batch of its items.
+    """A split of a set: a data set of (epoch, index), and the function that makes a batch of its items.
 
     Attributes:
-        dataset: its items are what `collate` takes.
+        dataset: of items for `collate`.
         collate: makes a batch; in a worker, unless `on_device`.
         identity: a hash of the shapes and their order.
-        on_device: whether `collate` renders, and does it where the model is.
+        on_device: whether `collate` renders on the model's device.
     """
 
     dataset: Dataset[Any]
@@ -69,17 +69,17 @@ def open_shapes(
     is_training: bool,
     folder: Path | None = None,
 ) -> Shapes:
-    """Open the part of a set that is trained on, or the part that is evaluated on.
+    """Open the split of a set for training or for evaluation.
 
     Args:
-        config: which set.
+        config: of the data.
         need: what the model needs of a shape.
-        seed: what views, backgrounds and noise are drawn from.
+        seed: of views, backgrounds and noise.
         device: where synthetic shapes are rendered.
-        views: how many views of each shape; by default as the configuration says.
+        views: how many views of each shape; by default those of the configuration.
         is_training: training takes `split`, `categories` and pose noise; evaluation `validation_split` and
-            `validation_categories`, never skips a shape, and turns no camera.
-        folder: of the run, where ``bad_samples.jsonl`` tells of shapes that were skipped; by default beside the shards.
+            `validation_categories`, without skipping of shapes and without pose noise.
+        folder: of the run, where ``bad_samples.jsonl`` lists the skipped shapes; by default beside the shards.
 
     Raises:
         OptionError: the shards hold no shape of this kind, no depth or no voxels of this resolution.
@@ -116,25 +116,25 @@ def open_shapes(
     if isinstance(found, SyntheticSet):
         on_device = device.type != "cpu"
         render = partial(render_batch, depth=need.depth, device=device, at_once=on_device)
-        told = [f"{found.seed}/{found.pool}/{number}" for number in found.numbers]
-        return Shapes(adapted, render, _identity(told), on_device)
+        names = [f"{found.seed}/{found.pool}/{number}" for number in found.numbers]
+        return Shapes(adapted, render, _identity(names), on_device)
     return Shapes(adapted, collate, _identity(dataset.names[:length]))
 
 
 def _synthetic(config: DataConfig, need: Need, split: str, categories: Sequence[str] | None) -> SyntheticSet:
-    """The shapes of one part of a finite set, which are described here and rendered as batches."""
+    """The shapes of one split of a finite set, which are rendered as batches."""
     endless = synthetic_numbers(split, categories, config.set_seed)
     below = itertools.takewhile(lambda number: number < config.shapes, endless)
     numbers = list(itertools.islice(below, config.limit))
     if not numbers:
         raise OptionError(
-            f"data: of {config.shapes} shapes of synthetic-13 none is of split {split!r}, categories {categories}"
+            f"data: none of {config.shapes} shapes of synthetic-13 is of split {split!r}, categories {categories}"
         )
     return SyntheticSet(numbers, need.image_size, config.set_seed, config.pool, is_rendered=False)
 
 
 def categories_of(wanted: str | Sequence[str]) -> tuple[str, ...] | None:
-    """The names of categories that "all" (None), "first", "second", a name or several stand for."""
+    """The categories of "all" (None), "first", "second", a name or several."""
     from lsmgeo.scenes.synthetic13 import CLASS_SPLITS
 
     if wanted == "all":
@@ -145,17 +145,17 @@ def categories_of(wanted: str | Sequence[str]) -> tuple[str, ...] | None:
 
 
 def _check_content(shards: ShardSet, need: Need) -> None:
-    """Say what shards lack before the first step does."""
+    """Check before the first step that shards have what the training needs."""
     first = shards.metadata(0)
     if need.depth and first.depth_step is None:
         raise OptionError(
-            f"data: source has no depth, which the model is trained with: {shards.folder} "
+            f"data: source has no depth, which the model needs: {shards.folder} "
             "(lsmgeo render writes it, unless --no_depth)"
         )
     if need.voxels is not None and need.voxels not in first.voxels:
-        there = ", ".join(map(str, first.voxels)) or "none"
+        known = ", ".join(map(str, first.voxels)) or "none"
         raise OptionError(
-            f"data: source has no voxels at the model's resolution {need.voxels}: {shards.folder} has {there} "
+            f"data: source has no voxels at the model's resolution {need.voxels}: {shards.folder} has {known} "
             f"(lsmgeo render --voxels {need.voxels} makes them)"
         )
     if min(first.size) < need.image_size:
@@ -173,17 +173,10 @@ def _identity(names: Sequence[str]) -> str:
 def endless_order(
     length: int, *, seed: int, start: int, batch: int, rank: int = 0, processes: int = 1
 ) -> Iterator[list[tuple[int, int]]]:
-    """The batches of one process of a run, without end, from any sample on: epoch after epoch, each in an own order.
+    """The endless batches of one process of a run, as (epoch, index) from sample `start` of all processes on.
 
-    A batch may hold the end of one epoch and the start of the next, so that every step takes equally many shapes.
-
-    Args:
-        length: number of shapes.
-        seed: what the orders are drawn from.
-        start: samples that all processes together have taken before.
-        batch: samples of a batch.
-        rank: which process this is.
-        processes: of how many.
+    Every epoch has its own order. A batch may hold the end of one epoch and the start of the next, so that every step
+    takes equally many of the `length` shapes.
 
     Example:
         >>> stream = endless_order(3, seed=0, start=0, batch=2, rank=1, processes=2)
@@ -205,17 +198,17 @@ def endless_order(
 def training_batches(
     shapes: Shapes, *, seed: int, start: int, batch: int, workers: int, device: torch.device, rank: int, processes: int
 ) -> Generator[Batch, None, None]:
-    """Batches to train on, without end, on the device. Close them: their workers are deaf to SIGTERM.
+    """Endless batches for training, on the device. Close them: their workers ignore SIGTERM.
 
     Args:
         shapes: of `open_shapes`.
-        seed: what the order is drawn from.
+        seed: of the order.
         start: samples that all processes together have taken before.
         batch: samples of a batch.
-        workers: processes that read ahead; 0 reads when a batch is asked for.
-        device: where the batches are wanted.
-        rank: which process this is.
-        processes: of how many.
+        workers: processes that read ahead; 0 reads when a batch is needed.
+        device: of the batches.
+        rank: of this process.
+        processes: how many there are.
     """
     order = endless_order(len(shapes), seed=seed, start=start, batch=batch, rank=rank, processes=processes)
     return _batches(shapes, order, workers, device)
@@ -232,17 +225,9 @@ def validation_batches(
     rank: int = 0,
     processes: int = 1,
 ) -> Generator[Batch, None, None]:
-    """Batches of always the same shapes with always the same views, each shape in one process. Close them.
+    """Batches of always the same `count` shapes, or all, with the same views, each shape in one process.
 
-    Args:
-        shapes: of `open_shapes`.
-        seed: what shapes are drawn from.
-        count: how many; fewer where there are not so many.
-        batch: samples of a batch.
-        device: where the batches are wanted.
-        workers: processes that read ahead.
-        rank: which process this is.
-        processes: of how many.
+    Close them, too; the other arguments are those of `training_batches`.
     """
     order = EpochSampler(len(shapes), seed=seed).order(0)[:count][rank::processes].tolist()
     chunks = [[(0, index) for index in order[first : first + batch]] for first in range(0, len(order), batch)]
@@ -257,7 +242,7 @@ def _batches(shapes: Shapes, order: Iterable[Any], workers: int, device: torch.d
         collate_fn=list if shapes.on_device else shapes.collate,
         worker_init_fn=ignore_stop,
         pin_memory=device.type == "cuda" and not shapes.on_device,
-        # Its own: the loader draws a seed for its workers, which must not move the run's random numbers.
+        # Its own: the loader draws a seed for its workers, which must not change the run's random numbers.
         generator=torch.Generator(),
     )
     for items in loader:

@@ -1,8 +1,8 @@
-"""Checkpoints that are whole or not there: what a run saves, and how it comes back to it bit by bit.
+"""Checkpoints of a run, written atomically, from which it resumes bit by bit.
 
-A checkpoint is a folder. It is written under another name, brought to the disk file by file, and renamed, so that
-neither a kill nor a loss of power at any moment leaves less than the checkpoints from before. ``meta.json`` holds size
-and SHA-256 of the files and of itself; what does not match is not read.
+A checkpoint is a folder. It is written under another name, synced to the disk file by file, and renamed, so that the
+checkpoints from before survive a kill or a loss of power at any moment. ``meta.json`` holds size and SHA-256 of the
+files and of itself; files that do not match are not read.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ MAX_META_BYTES = 1 << 24
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A checkpoint that was read and verified.
+    """A verified checkpoint.
 
     Args:
         path: its folder.
         step: how many steps had been taken.
         config: the configuration of the run that saved it.
-        best: the step of the best checkpoint at that time, if any was called that.
-        weights: the model's tensors, and the settings that the model is made from.
-        state: everything else by name: optimiser, guard, place of the run, ...
+        best: the step of the best checkpoint at that time, if any.
+        weights: the model's tensors and settings.
+        state: everything else by name: optimiser, guard, progress of the run, ...
     """
 
     path: Path
@@ -69,29 +69,14 @@ class Checkpoint:
     state: Mapping[str, Any]
 
     def part(self, name: str) -> Any:
-        """One part of the state.
-
-        Args:
-            name: as it was given to `save_checkpoint`.
-
-        Raises:
-            CheckpointError: there is none of this name.
-        """
+        """One part of the state; a CheckpointError where there is none of this name."""
         if name not in self.state:
-            there = ", ".join(sorted(self.state)) or "nothing"
-            raise CheckpointError(self.path, f"{STATE} has no {name!r}; it has {there}")
+            known = ", ".join(sorted(self.state)) or "nothing"
+            raise CheckpointError(self.path, f"{STATE} has no {name!r}; it has {known}")
         return self.state[name]
 
     def restore(self, name: str, target: Any) -> None:
-        """Give a part of the state to an object's ``load_state_dict``.
-
-        Args:
-            name: as it was given to `save_checkpoint`.
-            target: optimiser, schedule, scaler, sampler, guard: whatever has ``load_state_dict``.
-
-        Raises:
-            CheckpointError: there is no such part, or the object cannot use it.
-        """
+        """Give a part of the state to an object's ``load_state_dict``; a CheckpointError where it does not fit."""
         state = self.part(name)
         try:
             if hasattr(target, "param_groups"):
@@ -113,10 +98,10 @@ def save_checkpoint(
     best: int | None = None,
     about: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write a checkpoint, wholly or not at all, then remove the oldest ones. One process of a run does this.
+    """Write a checkpoint atomically, then remove the oldest ones. One process of a run does this.
 
     Args:
-        folder: the run's folder of checkpoints; made if it is not there.
+        folder: the run's folder of checkpoints; made if it does not exist.
         step: how many steps have been taken.
         model: a model of `lsmgeo.models.create`, not wrapped.
         state: everything else that a resumed run needs, by name: numbers, strings, tensors, lists and dicts of them.
@@ -129,9 +114,9 @@ def save_checkpoint(
         The checkpoint's folder.
 
     Raises:
-        CheckpointError: it cannot be written: the disk is full, the folder is read-only, and the like. The checkpoints
-            from before are as they were and nothing half-written stays.
-        OptionError: the state or the configuration holds what a checkpoint cannot.
+        CheckpointError: it cannot be written (the disk is full, the folder is read-only, ...). The checkpoints from
+            before are unchanged and nothing half-written stays.
+        OptionError: the state or the configuration holds what a checkpoint cannot, or `load` could not build the model.
     """
     folder = Path(folder)
     final = folder / step_folder(step)
@@ -145,10 +130,10 @@ def save_checkpoint(
                 write_atomic(made / name, content)
     except DataError as error:
         raise CheckpointError(final, error.reason) from error
-    # From here on the checkpoint stands, and the next one makes up for what fails.
+    # The checkpoint is written; the next one makes up for what fails from here on.
     try:
         write_atomic(folder / LATEST, f"{final.name}\n".encode())
-        # Those of later steps are damaged, or this run would have begun with them; they go when it reaches their steps.
+        # Those of later steps are damaged, or this run would have resumed from them; it replaces them later.
         for number in [number for number in checkpoint_folders(folder) if number <= step][keep:]:
             if number != best:
                 remove_folder(folder / step_folder(number))
@@ -158,7 +143,7 @@ def save_checkpoint(
 
 
 def load_latest(path: str | os.PathLike[str]) -> Checkpoint | None:
-    """Read and verify a checkpoint, or the newest one that verifies; a warning names those of later steps.
+    """Read and verify a checkpoint, or the newest one that is not damaged; a warning names those of later steps.
 
     Args:
         path: a checkpoint, a run folder or its folder of checkpoints.
@@ -180,17 +165,17 @@ def load_latest(path: str | os.PathLike[str]) -> Checkpoint | None:
 
 
 def check_config(checkpoint: Checkpoint, config: Mapping[str, Any], *, free: Collection[str] = ()) -> None:
-    """Refuse to resume a run as another one.
+    """Refuse to resume from a checkpoint of another run.
 
     Args:
-        checkpoint: what to resume from.
-        config: of the resuming run, as for `save_checkpoint`.
+        checkpoint: to resume from.
+        config: of this run, as for `save_checkpoint`.
         free: dotted names of what may differ, for example "run.steps".
 
     Raises:
         CheckpointError: another value is different, missing or new; the message names the first.
     """
-    # What JSON makes of it (lists of tuples) is what the checkpoint holds.
+    # The checkpoint holds the configuration as JSON does (lists for tuples).
     before, now = dict(_leaves(checkpoint.config)), dict(_leaves(json.loads(_canonical(config))))
     for key in sorted(before.keys() | now.keys()):
         was, is_now = before.get(key, "missing"), now.get(key, "missing")
@@ -202,7 +187,7 @@ def _encode_state(state: Mapping[str, Any]) -> bytes:
     buffer = io.BytesIO()
     torch.save(dict(state), buffer)
     try:
-        # What cannot be read back is to be found out now, and not after the power failed.
+        # Find out now, and not after a loss of power, what cannot be read back.
         torch.load(io.BytesIO(buffer.getvalue()), weights_only=True)
     except Exception as error:
         reason = str(error)[:400]
@@ -254,7 +239,7 @@ def _read(folder: Path) -> Checkpoint:
     except Exception as error:
         raise CheckpointError(folder / STATE, f"cannot be read ({str(error)[:400]})") from error
     if not isinstance(state, dict):
-        raise CheckpointError(folder / STATE, f"holds no state but {type(state).__name__}")
+        raise CheckpointError(folder / STATE, f"must hold a dict; it holds a {type(state).__name__}")
     match = STEP.fullmatch(folder.name)
     if match and int(match[1]) != step:
         raise CheckpointError(folder, f"is the checkpoint of step {step}, as its {META} says")
@@ -281,7 +266,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
 
 
 def _missing(folder: Path, newest: int) -> Path | None:
-    """The checkpoint that the pointer in a folder names, if it is later than the newest one there."""
+    """The checkpoint that ``LATEST`` in a folder names, if it is later than the newest one there."""
     try:
         named = read_file(folder / LATEST, 64).decode("ascii").strip()
     except (CheckpointError, UnicodeDecodeError):
@@ -291,7 +276,7 @@ def _missing(folder: Path, newest: int) -> Path | None:
 
 
 def _check_moments(groups: list[dict[str, Any]], state: Mapping[str, Any]) -> None:
-    """Refuse moments of another shape than their parameter, which ``load_state_dict`` of optimisers takes."""
+    """Refuse moments of another shape than their parameter, which optimisers' ``load_state_dict`` accepts."""
     shapes = [tuple(parameter.shape) for group in groups for parameter in group["params"]]
     for index, moments in state["state"].items():
         for name, moment in moments.items():

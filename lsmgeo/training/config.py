@@ -25,14 +25,14 @@ SHARE = (0, 1)
 
 @dataclass(frozen=True, kw_only=True)
 class ModelConfig:
-    """Which network; see `lsmgeo.models.create`.
+    """The network, see `lsmgeo.models.create`.
 
     Attributes:
         name: "voxel-lsm", "depth-lsm", "r2n2" or "r2n2-pose".
         preset: "paper", "compact", "standard" or "tiny".
         variant: "paper" or "release".
-        settings: what differs from the preset, as `create` takes it.
-        weights: a file of weights to begin with (`lsmgeo.models.load`) whose model is of the same settings, or None.
+        settings: that differ from the preset's, by name.
+        weights: a file of weights to start from (`lsmgeo.models.load`), of a model with the same settings, or None.
     """
 
     name: str = "voxel-lsm"
@@ -47,25 +47,25 @@ class ModelConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class DataConfig:
-    """What is trained on.
+    """The training data.
 
     Attributes:
-        source: a folder of shards (``lsmgeo render``, ``lsmgeo convert``), or "synthetic-13", which is rendered as it
-            is needed, on the device that trains.
+        source: a folder of shards (``lsmgeo render``, ``lsmgeo convert``), or "synthetic-13", which is rendered during
+            training, on the device that trains.
         shapes: of synthetic-13, the number of shapes in the set, before it is split.
         set_seed: of synthetic-13, which set.
         pool: of synthetic-13, the number of different views that a shape has.
-        views: how many views of a shape the model is given, in random order; (low, high) for a random number of them.
-        background: "white", an RGB colour in [0, 1], "random", or a folder of pictures.
+        views: how many views of a shape the model reads, in random order; (low, high) for a random number of them.
+        background: "white", an RGB colour in [0, 1], "random", or a folder of images.
         categories: "all", "first" or "second" (the halves of the experiment with unseen classes), or names.
-        split: the part of the set that is trained on.
-        validation_split: the part that is evaluated on.
+        split: the split of the set for training.
+        validation_split: the split for evaluation.
         validation_categories: as `categories`; None for the same.
-        limit: at most so many shapes of each part; None for all.
-        pose_noise: cameras are turned about the object by up to so many degrees, in training only.
+        limit: at most so many shapes of each split; None for all.
+        pose_noise: cameras are rotated about the object by up to so many degrees, in training only.
         workers: processes that read ahead; 0 reads in the training loop.
         on_error: "raise" at a shape that cannot be read, or "skip" it, see `lsmgeo.data.ShapeDataset`.
-        max_bad_fraction: the share of such shapes that "skip" puts up with.
+        max_bad_fraction: the largest share of such shapes that "skip" allows.
     """
 
     source: str = "synthetic-13"
@@ -102,7 +102,7 @@ class DataConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class OptimiserConfig:
-    """Adam, and how large its steps are.
+    """Adam and its learning rate.
 
     Attributes:
         learning_rate: of Adam.
@@ -128,7 +128,7 @@ class OptimiserConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
-    """How long, how, and what is kept.
+    """How long and how to train, and what to keep.
 
     Attributes:
         steps: the run ends after so many steps; None for no such end.
@@ -136,23 +136,22 @@ class RunConfig:
         cpu_minutes: where `steps` is None, the run ends after so many minutes of the process's CPU time, its
             evaluations included. The first 30 steps are timed, and the number of steps is computed once: it is `steps`
             from then on, in ``config.json`` and whenever the run is resumed, so that a schedule counts steps. A cosine
-            begins after these 30. What reading workers take is not counted. Beside `steps`, which take precedence, it
-            says where they came from.
+            begins after these 30. The time of reading workers is not counted. `steps` takes precedence.
         seed: of the weights, of the order of the shapes and of their views.
-        batch: shapes that a process takes at once.
-        accumulation: batches whose gradients make one step: a step takes batch x accumulation x processes shapes.
-        device: "auto" takes a GPU where there is one; "cpu".
-        precision: "no", "bf16" or "fp16": what is computed in fewer bits (weights stay float32). "auto" is bf16
-            where the hardware multiplies it faster (GPUs that know it, CPUs with AMX), decided once for the run.
-        channels_last: whether feature maps are kept pixel by pixel in memory; None where it is faster for the network.
+        batch: shapes per batch and process.
+        accumulation: batches per step: a step takes batch x accumulation x processes shapes.
+        device: "auto" is a GPU where there is one; or "cpu".
+        precision: "no", "bf16" or "fp16": of mixed precision (weights stay float32). "auto" is bf16 where the hardware
+            multiplies it faster (GPUs with bf16, CPUs with AMX), chosen once for the run.
+        channels_last: whether feature maps are channels-last in memory; None where it is faster for the network.
         loss: of voxels: "bce", the paper's cross-entropy, or "bce+iou", see `lsmgeo.models.compute_loss`.
         loss_views: the loss is taken after "every" view, after a "random" one (later views are not read, and of depth
-            that of the views so far counts), or after the "last" alone.
+            that of the views so far counts), or only after the "last".
         region: of depth, the pixels of the loss: the "object", or "all" with the background far away.
         evaluate_every: steps between evaluations; the end is always evaluated.
-        evaluate_shapes: how many shapes of the validation split are evaluated on, always the same.
-        evaluate_views: how many views of each, always the same; None for the most that the model trains on.
-        pictures: how many of these shapes are drawn at each evaluation.
+        evaluate_shapes: how many shapes of the validation split, always the same.
+        evaluate_views: how many views of each, always the same; None for the largest number in training.
+        pictures: how many of these shapes are drawn after each evaluation.
         checkpoint_every: steps between checkpoints; the end is always saved.
         keep: how many checkpoints are kept, besides the best.
         log_every: steps between lines of the log.
@@ -190,7 +189,7 @@ class RunConfig:
             raise OptionError("run: steps, minutes or cpu_minutes must say when the run ends; got none")
 
 
-# What a resumed run may do otherwise than before: nothing of it changes what is learnt from a step.
+# What a resumed run may change: nothing that affects the result of a step.
 FREE = (
     *("data.source", "data.workers", "data.on_error", "data.max_bad_fraction", "model.weights"),
     *("run.steps", "run.minutes", "run.device", "run.evaluate_every", "run.evaluate_shapes", "run.evaluate_views"),
@@ -201,13 +200,13 @@ FREE = (
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingConfig:
-    """All settings of a run; equal settings on one machine give equal weights.
+    """All settings of a run; equal settings on one computer give equal weights.
 
     Attributes:
-        model: which network.
-        data: what it is trained on.
-        optimiser: Adam, and how large its steps are.
-        run: how long, how, and what is kept.
+        model: the network.
+        data: the training data.
+        optimiser: Adam and its learning rate.
+        run: how long and how to train, and what to keep.
 
     Example:
         >>> config = TrainingConfig(model=ModelConfig(preset="tiny"), run=RunConfig(steps=100))
@@ -224,7 +223,7 @@ class TrainingConfig:
         low, high = self.data.view_range
         if self.run.loss_views == "random" and low != high:
             raise OptionError(
-                "run: loss_views must be 'every' or 'last' where shapes have differently many views; "
+                "run: loss_views must be 'every' or 'last' where numbers of views differ; "
                 f"got 'random' with data.views = {self.data.views!r}"
             )
         if self.optimiser.schedule == "cosine" and self.run.steps is None and self.run.cpu_minutes is None:
@@ -233,7 +232,7 @@ class TrainingConfig:
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """The settings as JSON holds them."""
+        """The settings in types that JSON has."""
         return json.loads(json.dumps(asdict(self)))
 
     def free(self) -> tuple[str, ...]:
@@ -250,10 +249,10 @@ def make_config(values: Mapping[str, Any]) -> TrainingConfig:
     """A configuration from nested mappings, as TOML and JSON give them.
 
     Args:
-        values: groups "model", "data", "optimiser", "run", each a mapping; what is missing takes its default.
+        values: groups "model", "data", "optimiser", "run", each a mapping; missing values take their defaults.
 
     Raises:
-        OptionError: a key that there is not, with the nearest that there is; a value of the wrong kind or out of range.
+        OptionError: an unknown key, with the nearest known one; a value of the wrong kind or out of range.
 
     Example:
         >>> make_config({"run": {"stepz": 100}})
@@ -282,11 +281,11 @@ def read_config(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> 
 
     Args:
         path: a TOML or JSON file with the tables model, data, optimiser and run.
-        overrides: settings that come before the file's, such as "run.steps=100" or "data.views=[1,4]"; "none" for None.
+        overrides: settings in place of the file's, such as "run.steps=100" or "data.views=[1,4]"; "none" for None.
 
     Raises:
-        DataError: the file cannot be read, or is no configuration.
-        OptionError: an override that is none.
+        DataError: the file cannot be read, or is not a configuration.
+        OptionError: an invalid override.
     """
     path = Path(path)
     text = read_text(path, MAX_BYTES)
@@ -315,7 +314,7 @@ def read_config(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> 
 
 
 def _parsed(text: str) -> Any:
-    """A value as TOML writes it; what TOML does not understand is text."""
+    """A value as TOML writes it; anything else is text."""
     if text.lower() == "none":
         return None
     try:
@@ -325,6 +324,6 @@ def _parsed(text: str) -> Any:
 
 
 def _nearest(key: str, known: Sequence[str]) -> str:
-    # The right name in the wrong group comes before a like one in the right group.
+    # The right name in the wrong group takes precedence over a similar one in the right group.
     near = [name for name in known if "." in key and name.rpartition(".")[2] == key.rpartition(".")[2]]
     return f"; did you mean {near[0]}?" if near else suggestion(key, known)

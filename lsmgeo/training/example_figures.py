@@ -1,4 +1,4 @@
-"""What a model predicts beside what is true, as one picture for the log."""
+"""Predictions beside the truth, as one image for the log."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ELEVATION = 25.0
 
 
 class Example(NamedTuple):
-    """A shape with what was predicted of it after each of its V views, on the CPU.
+    """A shape and its predictions after each of its V views, on the CPU.
 
     Attributes:
         sample: the truth.
@@ -32,16 +32,13 @@ class Example(NamedTuple):
 
 
 def draw_examples(examples: Sequence[Example]) -> Pixels:
-    """Draw shapes below each other: above the views in their order, below what is predicted after each, and the truth.
+    """Draw shapes, each as a row of its views above a row of the prediction after each view, and the truth.
 
-    Of depth, what is predicted after all views stands below each view, and the truth below that, as maps (near is
-    bright) and as surfaces seen from beside the camera.
+    Of depth, the prediction after all views is below each view, and the truth below that, as maps (near is bright) and
+    as surfaces seen from beside the camera.
 
     Args:
         examples: at least one, all of occupancy or all of depth.
-
-    Returns:
-        (h, w, 3) uint8.
     """
     rows: list[list[Pixels | None]] = []
     for example in examples:
@@ -75,6 +72,6 @@ def _depth_rows(example: Example) -> list[list[Pixels | None]]:
 
 
 def _azimuth(cameras: CameraTensors) -> float:
-    """From which side the first camera looks at the origin, in degrees."""
+    """The azimuth of the first camera, in degrees."""
     x, _, z = centers(cameras.at(0)).double().cpu()
     return float(torch.rad2deg(torch.atan2(z, x)))

@@ -1,6 +1,6 @@
-"""What stands before the first step and between processes: devices, the model, being asked to stop, agreeing.
+"""Start and stop of a run: devices, the model, signals, and what several processes agree on.
 
-A signal sets a flag, and training ends where nothing is lost. With a single process every answer is its own.
+A signal sets a flag, and training ends where nothing is lost.
 """
 
 from __future__ import annotations
@@ -46,11 +46,9 @@ Item = TypeVar("Item")
 
 
 def resolve_config(config: TrainingConfig, checkpoint: Checkpoint | None) -> TrainingConfig:
-    """A configuration with what is left to the trainer filled in: as a run that goes on has it, else for this hardware.
+    """Fill in the settings that the trainer chooses: those of a resumed run, else the best for this hardware.
 
-    Args:
-        config: of the run; precision may be "auto", `channels_last` None, `steps` None where `cpu_minutes` are given.
-        checkpoint: that the run goes on from, if any.
+    They are precision "auto", `channels_last` None, and `steps` None where `cpu_minutes` are given.
     """
     run = config.run
     before = {} if checkpoint is None else checkpoint.config.get("run", {})
@@ -69,9 +67,6 @@ def fast_precision(device: str) -> str:
     """The precision in which the hardware multiplies fastest: "bf16" or "no".
 
     A CPU without units for bfloat16 is slower in it than in float32 (docs/experiments).
-
-    Args:
-        device: "auto" or "cpu".
     """
     if device != "cpu" and torch.cuda.is_available():
         return "bf16" if torch.cuda.is_bf16_supported(including_emulation=False) else "no"
@@ -80,14 +75,14 @@ def fast_precision(device: str) -> str:
 
 @contextlib.contextmanager
 def start_accelerator(run: RunConfig, *, has_idle_parameters: bool) -> Iterator[Accelerator]:
-    """The processes of a run, as `torchrun` started them, or this one alone.
+    """The accelerator of a run, of the processes that `torchrun` started, or of this one.
 
     Args:
-        run: says device and precision.
+        run: has device and precision.
         has_idle_parameters: whether some parameters get no gradient, always or from some batches.
 
     Raises:
-        OptionError: accelerate is not installed, or the device cannot compute in this precision.
+        OptionError: accelerate is not installed, or the device does not support this precision.
     """
     try:
         from accelerate import Accelerator
@@ -112,10 +107,10 @@ def start_accelerator(run: RunConfig, *, has_idle_parameters: bool) -> Iterator[
 
 @contextlib.contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Keep a run's folder for this process: two that trained in it would take each other's checkpoints away.
+    """Lock a run's folder for this process: two that train in it would remove each other's checkpoints.
 
     Raises:
-        TrainingError: another process holds it.
+        TrainingError: another process has locked it.
         DataError: it cannot be written.
     """
     try:
@@ -129,7 +124,7 @@ def hold_folder(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise DataError(folder, f"cannot be written ({error})") from error
     try:
-        # A lock of the process, which its workers do not inherit: it ends with the process, however that ends.
+        # The process's workers do not inherit this lock; it ends with the process, however that ends.
         try:
             fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except (BlockingIOError, PermissionError) as error:
@@ -145,7 +140,7 @@ def make_model(config: ModelConfig, run: RunConfig, device: torch.device) -> Mod
     """The model that is trained, with weights from the seed or from a file.
 
     Raises:
-        OptionError: there is no such model, or the file holds another.
+        OptionError: there is no such model, or the file holds another one.
         CheckpointError: the file cannot be used.
     """
     torch.manual_seed(run.seed)
@@ -155,8 +150,8 @@ def make_model(config: ModelConfig, run: RunConfig, device: torch.device) -> Mod
         theirs = settings_of(other)
         for key, mine in settings_of(model).items():
             if mine != theirs.get(key):
-                there = f"{key} is {theirs.get(key)!r} in {config.weights}, {mine!r} here"
-                raise OptionError(f"model: weights are of another model: {there}")
+                difference = f"{key} is {theirs.get(key)!r} in {config.weights}, {mine!r} here"
+                raise OptionError(f"model: weights are of another model: {difference}")
         model.load_state_dict(other.state_dict())
     model.to(device)
     if run.channels_last:
@@ -168,7 +163,7 @@ def make_model(config: ModelConfig, run: RunConfig, device: torch.device) -> Mod
 
 
 class StopRequest:
-    """Whether somebody asked this process to stop; made by `catch_stop`."""
+    """Whether a signal asked this process to stop; see `catch_stop`."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -179,23 +174,17 @@ class StopRequest:
 
     @property
     def exit_code(self) -> int:
-        """What the process should end with: 128 plus the signal's number, 143 for SIGTERM; 0 if none came."""
+        """The process's exit code: 128 plus the signal's number, 143 for SIGTERM; 0 without a signal."""
         return 0 if self.signal is None else 128 + self.signal
 
     def next_item(self, items: Iterator[Item]) -> Item | None:
         """The next of ``items``, or None as soon as a stop is asked for, however long the item would take.
 
-        The iterator may be broken after None: leave it alone.
-
-        Args:
-            items: for example a loader's iterator.
-
-        Raises:
-            StopIteration: as ``next``.
+        After None the iterator may be broken: do not use it.
         """
         try:
             try:
-                # Set first, so that a signal that comes between the two lines is seen by one of them.
+                # Set first: a signal between the two lines is noticed by one of them.
                 self._waiting = True
                 return None if self else next(items)
             finally:
@@ -205,9 +194,9 @@ class StopRequest:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.signal == number:
-            # Whoever asks twice does not want to wait; a checkpoint cut off here is as after a loss of power.
+            # The second request does not wait; a checkpoint cut off here is as after a loss of power.
             os._exit(128 + number)
-        if self:  # Ctrl-C reaches torchrun too, which then sends its processes SIGTERM
+        if self:  # Ctrl-C reaches torchrun too, which then sends SIGTERM to its processes
             return
         self.signal = number
         if self._waiting:
@@ -216,19 +205,16 @@ class StopRequest:
 
 
 class _Asked(BaseException):
-    """Leaves a wait for data; no handler of ordinary errors on the way may swallow it."""
+    """Interrupts a wait for data; handlers of ordinary errors do not catch it."""
 
 
 @contextlib.contextmanager
 def catch_stop() -> Iterator[StopRequest]:
     """Inside this context the first SIGTERM or SIGINT only sets a flag; the same again ends the process at once.
 
-    The flag is to be looked at wherever training spends time: between steps, between the batches of an evaluation,
-    after a checkpoint, and while waiting for data (`StopRequest.next_item`). The handlers from before come back at the
-    end. Outside the main thread, where Python allows no handlers, the flag stays unset.
-
-    Yields:
-        The flag; it is true once a signal has come.
+    Training checks the flag wherever it spends time: between steps, between the batches of an evaluation, after a
+    checkpoint, and while waiting for data (`StopRequest.next_item`). The handlers from before are restored at the end.
+    Outside the main thread, where Python allows no handlers, the flag stays unset.
 
     Example:
         >>> with catch_stop() as stop:
@@ -250,30 +236,18 @@ def catch_stop() -> Iterator[StopRequest]:
 
 
 def ignore_stop(worker: int = 0) -> None:
-    """Make a loader's worker deaf to SIGTERM and SIGINT: it ends with its parent, which has work to save first.
-
-    Args:
-        worker: the worker's number, unused; so that this is a ``worker_init_fn``.
-    """
+    """A ``worker_init_fn``: the worker ignores SIGTERM and SIGINT and ends with its parent, which saves first."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def any_true(flag: bool) -> bool:
-    """Whether the flag is true in any process. All processes must call this together.
-
-    Args:
-        flag: this process's.
-    """
+    """Whether the flag is true in any process. All processes must call this together."""
     return any(gather(flag))
 
 
 def gather(value: Item) -> list[Item]:
-    """The values of all processes in the order of their ranks. All processes must call this together.
-
-    Args:
-        value: this process's: numbers, strings, tensors and containers of them.
-    """
+    """The values of all processes in the order of their ranks. All processes must call this together."""
     if not (distributed.is_available() and distributed.is_initialized()):
         return [value]
     values: list[Item | None] = [None] * distributed.get_world_size()
@@ -281,16 +255,16 @@ def gather(value: Item) -> list[Item]:
     return values  # type: ignore[return-value]
 
 
-def check_agreement(things: Mapping[str, object]) -> None:
-    """Refuse to train where processes start from different things.
+def check_agreement(state: Mapping[str, object]) -> None:
+    """Refuse to train where processes start from different states.
 
     Args:
-        things: what must be the same everywhere, by name: the configuration, checksums of parameters and of data.
+        state: what must be the same in all processes, by name: the configuration, checksums of parameters and of data.
 
     Raises:
-        TrainingError: a thing differs; the message names it and the first process that differs.
+        TrainingError: a value differs; the message names it and the first process that differs.
     """
-    for rank, others in enumerate(gather(dict(things))):
-        for name, own in things.items():
+    for rank, others in enumerate(gather(dict(state))):
+        for name, own in state.items():
             if own != (other := others[name]):
                 raise TrainingError(f"processes do not agree: {name} is {own!r} here and {other!r} in process {rank}")

@@ -1,4 +1,4 @@
-"""What a run tells while it goes: lines of JSON, TensorBoard, pictures, and a bar or a line now and then."""
+"""The log of a run: lines of JSON, TensorBoard, images of predictions, a progress bar."""
 
 from __future__ import annotations
 
@@ -14,11 +14,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from lsmgeo.data.atomic_files import write_atomic
 from lsmgeo.data.images import encode_png
+from lsmgeo.drawing import Pixels
 from lsmgeo.errors import DataError
 from lsmgeo.training.config import RunConfig
 from lsmgeo.training.example_figures import draw_examples
@@ -31,14 +29,14 @@ SECONDS_BETWEEN_LINES = 30.0
 
 
 class RunLog:
-    """The log of a run, written by its first process; the others hold one that does nothing.
+    """The log of a run, written by its first process only.
 
-    A full disk does not end the run: the first line that cannot be written warns, and later ones are tried again.
+    A full disk does not end the run: the first line that cannot be written gives a warning, and later ones are tried.
 
     Args:
         folder: the run's folder.
-        run: says where it ends, and whether to write for TensorBoard.
-        step: where the run begins or goes on; what TensorBoard shows from later steps is replaced.
+        run: has the number of steps, and whether to write for TensorBoard.
+        step: where the run begins or is resumed; TensorBoard's curves of later steps are replaced.
         is_writer: whether this process writes.
         quiet: whether to show no progress.
     """
@@ -64,7 +62,7 @@ class RunLog:
             self._bar = tqdm(total=run.steps, initial=step, unit="step", dynamic_ncols=True, smoothing=0.05)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the rest."""
         if self._bar is not None:
             self._bar.close()
         if self._board is not None:
@@ -72,12 +70,7 @@ class RunLog:
                 self._board.close()
 
     def event(self, name: str, **values: Any) -> None:
-        """Append a line.
-
-        Args:
-            name: what happened.
-            values: what JSON holds; numbers that are not finite become text.
-        """
+        """Append a line of what JSON holds; numbers that are not finite become text."""
         if not self.is_writer:
             return
         line = json.dumps({"event": name, **_plain(values), "time": round(time.time(), 3)}, allow_nan=False)
@@ -87,32 +80,19 @@ class RunLog:
             self._warn(LOG, f"{self.folder / LOG}: cannot be written ({error}); the run goes on")
 
     def step(self, step: int, *, waited: float, **values: float) -> None:
-        """A step's line, and its curves.
-
-        Args:
-            step: how many steps have been taken.
-            waited: seconds for which the step waited for data.
-            values: loss, gradient_norm, learning_rate, epoch, seconds of training so far.
-        """
+        """The line and curves of a step that waited so many seconds for data, with its loss, learning rate, ..."""
         self.event("step", step=step, **values, waited=_short(waited))
         self.scalars(step, {f"train/{name}": value for name, value in values.items()})
 
     def evaluation(self, step: int, found: Evaluation, *, seconds: float, best: int | None) -> None:
-        """What an evaluation found: a line, curves and pictures.
-
-        Args:
-            step: how many steps had been taken.
-            found: by the evaluation.
-            seconds: that it took.
-            best: the step of the best so far.
-        """
+        """The line, curves and image of an evaluation after `step` steps; `best` is the step of the best so far."""
         self.event("evaluation", step=step, **found.fields(), evaluation_seconds=_short(seconds), best=best)
         by_view = {f"{found.measure}/{view}_views": value for view, value in found.by_view.items()}
         by_category = {f"{found.measure}_by_category/{name}": value for name, value in found.categories.items()}
         self.scalars(step, {"loss/held_back": found.loss, **by_view, **by_category})
         self.say(f"step {step}: {found.title} {found.words}")
         if found.examples and self.is_writer:
-            self.picture(step, draw_examples(found.examples))
+            self.image(step, draw_examples(found.examples))
 
     def plan(self, steps: int) -> None:
         """The number of steps is known."""
@@ -124,22 +104,22 @@ class RunLog:
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
         """Curves for TensorBoard."""
         if self._board is not None:
-            with self._forgiven():
+            with self._warn_of_errors():
                 for name, value in values.items():
                     self._board.add_scalar(name, value, step)
 
-    def picture(self, step: int, picture: npt.NDArray[np.uint8]) -> None:
-        """What is predicted (h, w, 3): for TensorBoard, and as ``pictures/predicted_STEP.png``."""
+    def image(self, step: int, image: Pixels) -> None:
+        """Predictions (h, w, 3): for TensorBoard, and as ``pictures/predicted_STEP.png``."""
         try:
-            write_atomic(self.folder / "pictures" / f"predicted_{step:08d}.png", encode_png(picture))
+            write_atomic(self.folder / "pictures" / f"predicted_{step:08d}.png", encode_png(image))
         except DataError as error:
             self._warn("pictures", f"{error}; the run goes on")
         if self._board is not None:
-            with self._forgiven():
-                self._board.add_image("predicted", picture, step, dataformats="HWC")
+            with self._warn_of_errors():
+                self._board.add_image("predicted", image, step, dataformats="HWC")
 
     def progress(self, step: int, text: str) -> None:
-        """Show where the run is: at every call on a terminal, elsewhere a line every half minute."""
+        """Show the progress: at every call on a terminal, elsewhere a line every half minute."""
         if self._bar is not None:
             self._bar.update(step - self._bar.n)
             self._bar.set_postfix_str(text, refresh=False)
@@ -160,16 +140,16 @@ class RunLog:
 
             return SummaryWriter(str(self.folder / "tensorboard"), purge_step=step or None)
         except ImportError:
-            warnings.warn("tensorboard is not installed: log.jsonl and pictures alone are written", stacklevel=3)
+            warnings.warn("tensorboard is not installed: only log.jsonl and pictures are written", stacklevel=3)
         except OSError as error:
             self._warn("tensorboard", f"TensorBoard's files cannot be written ({error}); the run goes on")
         return None
 
     @contextlib.contextmanager
-    def _forgiven(self) -> Any:
+    def _warn_of_errors(self) -> Any:
         try:
             yield
-        # Its writer is a thread, whose errors come with a later call.
+        # Its writer is a thread, whose errors are raised by a later call.
         except (OSError, RuntimeError) as error:
             self._board = None
             self._warn("tensorboard", f"TensorBoard's files cannot be written ({error}); the run goes on without")
@@ -188,7 +168,7 @@ def _append_line(path: Path, line: bytes) -> None:
         # A loss of power may have left half a line.
         begin = b"\n" if size and os.pread(descriptor, 1, size - 1) != b"\n" else b""
         content = begin + line + b"\n"
-        if os.write(descriptor, content) < len(content):  # there was room for a part
+        if os.write(descriptor, content) < len(content):  # there was room for only a part
             os.ftruncate(descriptor, size)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     finally:

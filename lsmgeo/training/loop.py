@@ -20,7 +20,7 @@ from lsmgeo.training.optim import (
     Gradients,
     find_gradients,
     learning_rate,
-    loss_steps,
+    loss_views_of,
     move_parameters,
 )
 from lsmgeo.training.run_state import Run
@@ -31,10 +31,10 @@ __all__ = ["Trained", "train"]
 
 @dataclass(frozen=True)
 class Trained:
-    """A run that has ended.
+    """A finished run.
 
     Attributes:
-        folder: the run's.
+        folder: of the run.
         step: how many steps it has taken.
         checkpoint: of this step.
         best: the step of the best evaluation, None where there was none.
@@ -149,7 +149,7 @@ def _take_steps(run: Run, batches: Iterator[Batch]) -> str:
             ended = "minutes"
             continue
 
-        after = loss_steps(settings, progress.step, run.most_views)
+        after = loss_views_of(settings, progress.step, run.most_views)
         gradients = find_gradients(run.wrapped, taken, optimiser, accelerator, settings, steps=after, terms=run.terms)
         progress.step += 1
         run.is_saved = False

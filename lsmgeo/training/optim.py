@@ -1,4 +1,4 @@
-"""One step of training: gradients of the mean loss over all shapes of all processes, Adam, and steps not to take."""
+"""One step of training: gradients of the mean loss over all shapes of all processes, Adam, and the guard of steps."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ __all__ = [
     "StepGuard",
     "find_gradients",
     "learning_rate",
-    "loss_steps",
+    "loss_views_of",
     "make_optimiser",
     "move_parameters",
 ]
 
-Steps = str | Sequence[int] | None
-# How many are timed where CPU minutes say when a run ends.
+Steps = str | Sequence[int] | None  # as the models take them
+# How many steps are timed where CPU minutes limit a run.
 TIMED_STEPS = 30
-# So many skipped steps are forgiven whatever share of all steps they are.
+# So many skipped steps are allowed, whatever their share of all steps.
 FORGIVEN = 5
 
 
 class Gradients(NamedTuple):
-    """What `find_gradients` leaves in the parameters' ``grad``, and of what.
+    """The result of `find_gradients`, beside the parameters' ``grad``.
 
     Attributes:
         loss: the mean over all shapes of all processes.
         norm: of the gradient of this mean.
-        factor: what ``grad`` is still to be multiplied by to be this gradient.
+        factor: ``grad`` times this factor is that gradient.
     """
 
     loss: float
@@ -53,20 +53,20 @@ class Gradients(NamedTuple):
 
     @property
     def is_finite(self) -> bool:
-        """Whether the parameters may follow it; the same in all processes, as loss and norm are."""
+        """Whether loss and norm are finite; the same in all processes."""
         return math.isfinite(self.loss) and math.isfinite(self.norm)
 
 
 class StepGuard:
-    """Counts the steps that must not be taken, and ends a training that has too many of them.
+    """Counts the steps that must be skipped, and ends a training that has too many of them.
 
-    A single gradient that is not finite poisons Adam's moments for good. A step whose loss or gradient is not finite in
-    any process is taken by none: neither parameters, nor the optimiser's moments, nor the schedule move. A scaler of
-    mixed precision is still to be updated, or it never lowers its scale.
+    One gradient that is not finite corrupts Adam's moments permanently. A step whose loss or gradient is not finite in
+    any process is skipped by all: parameters, the optimiser's moments and the schedule stay. The scaler of mixed
+    precision must still be updated, or it never lowers its scale.
 
     Args:
-        in_a_row: so many skipped steps in succession end the training; so do more than 5 that are ...
-        share: ... a larger share of all steps.
+        in_a_row: so many skipped steps in succession end the training; so do more than 5 skipped steps that are ...
+        share: ... more than this share of all steps.
 
     Example:
         >>> guard = StepGuard(in_a_row=2)
@@ -85,7 +85,7 @@ are unharmed. Last: step 2 with chair-0; step 3 with lamp-7
         self._last: list[str] = []
 
     def check(self, step: int, *, is_bad: bool, names: Sequence[str] = (), scale: float | None = None) -> bool:
-        """Say whether a step may be taken.
+        """Whether a step may be taken.
 
         Args:
             step: its number.
@@ -94,11 +94,8 @@ are unharmed. Last: step 2 with chair-0; step 3 with lamp-7
             scale: the scaler's, if all losses were finite in mixed precision with float16. Gradients that overflow
                 under a scale above 1 are how the scaler finds its scale: the step is skipped, and not counted.
 
-        Returns:
-            Whether to take it.
-
         Raises:
-            TrainingError: too many were skipped; the message holds the numbers and shapes of the last of them.
+            TrainingError: too many were skipped; the message has the numbers and shapes of the last of them.
         """
         state = self._state
         state["steps"] += 1
@@ -121,20 +118,16 @@ are unharmed. Last: step 2 with chair-0; step 3 with lamp-7
         raise TrainingError(reason)
 
     def state_dict(self) -> dict[str, int]:
-        """How many steps were judged, skipped, and skipped in succession."""
+        """How many steps were checked, skipped, and skipped in succession."""
         return self._state.copy()
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on counting from a state.
-
-        Args:
-            state: as from `state_dict`.
-        """
+        """Continue to count from a `state_dict`."""
         self._state = {name: state[name] for name in self._state}
 
 
 def make_optimiser(model: nn.Module, config: OptimiserConfig) -> torch.optim.Optimizer:
-    """Adam, or AdamW where weights decay."""
+    """Adam, or AdamW with weight decay."""
     kind = torch.optim.AdamW if config.weight_decay else torch.optim.Adam
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     return kind(parameters, lr=config.learning_rate, betas=config.betas, weight_decay=config.weight_decay, fused=True)
@@ -152,24 +145,24 @@ def find_gradients(
 ) -> Gradients:
     """The loss of some batches in every process, and its gradient in the parameters' ``grad``.
 
-    Processes and batches may hold differently many terms of the loss, since shapes have differently many views. So sums
-    are differentiated, and divided by the number of all terms in the end: shapes weigh the same wherever they are.
+    Numbers of views differ between shapes, and with them the numbers of terms of processes and batches. So sums are
+    differentiated and in the end divided by the number of all terms: shapes weigh the same in every batch and process.
 
     Args:
         wrapped: the model, as the accelerator prepared it; its gradients are None.
-        batches: of this process, one after the other.
+        batches: of this process.
         optimiser: of its parameters.
         accelerator: of the run.
-        run: says which loss.
-        steps: after which views the loss is taken, see `loss_steps`.
-        terms: about how many terms a batch has: sums are divided by it, so that gradients are of an ordinary size.
+        run: the settings of the loss.
+        steps: after which views the loss is taken, see `loss_views_of`.
+        terms: about how many terms a batch has: sums are divided by it, so that gradients have a normal size.
     """
     sums = torch.zeros(2, device=accelerator.device)
     for index, batch in enumerate(batches):
         is_last = index == len(batches) - 1
         with contextlib.nullcontext() if is_last else accelerator.no_sync(wrapped):
             if isinstance(steps, list):
-                # What is read later reaches no loss of voxels; of depth, that of the views so far counts.
+                # Later views change no loss of voxels; of depth, only the views so far count.
                 batch = batch.first_views(max(steps) + 1)
             output = wrapped(batch.images, batch.cameras, batch.view_mask, steps=steps)
             part, number = sum_loss(output, batch, region=run.region, loss=run.loss, steps=steps)
@@ -180,7 +173,7 @@ def find_gradients(
     if accelerator.scaler is not None:
         accelerator.scaler.unscale_(optimiser)
     of_all, number = sums.tolist()
-    # The processes' gradients were averaged, and are to be added.
+    # The processes' gradients were averaged, and must be summed.
     factor = terms * accelerator.num_processes / max(number, 1.0)
     gradients = [parameter.grad for parameter in wrapped.parameters() if parameter.grad is not None]
     return Gradients(of_all / max(number, 1.0), factor * float(torch.nn.utils.get_total_norm(gradients)), factor)
@@ -189,15 +182,7 @@ def find_gradients(
 def move_parameters(
     optimiser: torch.optim.Optimizer, accelerator: Accelerator, found: Gradients, *, rate: float, clip: float | None
 ) -> None:
-    """Take a step.
-
-    Args:
-        optimiser: its parameters hold what `find_gradients` found.
-        accelerator: of the run; its scaler, if there is one, is updated by the caller.
-        found: their loss and norm, finite.
-        rate: the learning rate.
-        clip: the largest norm; None for no such limit.
-    """
+    """Take a step along finite gradients, clipped to the norm `clip`; the caller updates the scaler."""
     factor = found.factor * (1.0 if clip is None or found.norm <= clip else clip / found.norm)
     groups = optimiser.param_groups
     gradients = [parameter.grad for group in groups for parameter in group["params"] if parameter.grad is not None]
@@ -219,7 +204,7 @@ def learning_rate(config: OptimiserConfig, taken: int, steps: int | None, *, hol
     Args:
         config: of the optimiser.
         taken: how many steps moved the parameters before; skipped ones do not count.
-        steps: where the run ends; None where that is not known yet, in the first `hold` steps.
+        steps: of the run; None where that is not known yet, in the first `hold` steps.
         hold: steps before a cosine begins.
 
     Example:
@@ -235,19 +220,13 @@ def learning_rate(config: OptimiserConfig, taken: int, steps: int | None, *, hol
     return rate
 
 
-def loss_steps(run: RunConfig, step: int, views: int) -> Steps:
-    """After which views the loss of a step is taken, as the models take it: the same in all processes.
-
-    Args:
-        run: of the run.
-        step: which.
-        views: the most that a shape has.
-    """
+def loss_views_of(run: RunConfig, step: int, views: int) -> Steps:
+    """After which of at most `views` views the loss of a step is taken: the same in all processes."""
     if run.loss_views == "every":
         return None
     if run.loss_views == "last":
         return "last"
-    # From the seed and the step alone, so that no state of a generator need be saved.
+    # A function of the seed and the step, so that no state of a generator is saved.
     state = np.random.SeedSequence([2, run.seed, step, 0x76696577]).generate_state(1, np.uint64)
     generator = torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
     return [int(torch.randint(views, (1,), generator=generator))]

@@ -51,20 +51,7 @@ class Progress:
 
 
 class Run:
-    """What one process of a run holds. Making it reads data and weights, and writes nothing.
-
-    Args:
-        config: of the run, resolved.
-        folder: the run's.
-        checkpoint: to go on from, if any.
-        accelerator: of the run.
-        stop: whether the process was asked to stop.
-
-    Raises:
-        OptionError, DataError: settings or data that cannot be used.
-        CheckpointError: the checkpoint is of another run, or does not fit.
-        TrainingError: processes do not start from the same state.
-    """
+    """What one process of a run holds. Construction opens data and weights, restores the checkpoint, writes nothing."""
 
     log: RunLog  # from `open_log` on
 
@@ -186,11 +173,7 @@ class Run:
             write_atomic(self.folder / CONFIG, json.dumps(self.config.to_dict(), indent=1).encode())
 
     def save(self, *, must: bool) -> None:
-        """Save a checkpoint of this step.
-
-        Args:
-            must: whether the run ends where it cannot be written; else a warning says so.
-        """
+        """Save a checkpoint of this step; where that fails, an error if it `must` be saved, else a warning."""
         progress, scaler, folder = self.progress, self.accelerator.scaler, self.folder / CHECKPOINTS
         progress.seconds, progress.cpu_seconds = self.seconds(), self.cpu_seconds()
         state = {
@@ -226,15 +209,7 @@ class Run:
             warnings.warn(f"{reason}; the run goes on without this checkpoint", stacklevel=3)
 
     def measure(self, shapes: int, images: int = 0) -> Evaluation | None:
-        """Evaluate the model.
-
-        Args:
-            shapes: on how many of those held back.
-            images: how many of them are drawn.
-
-        Returns:
-            What was found; None where a stop was asked for.
-        """
+        """Evaluate the model on `shapes` of those held back, and draw some of them; None where a stop was asked for."""
         settings, workers = self.config.run, min(1, self.config.data.workers)
         some = validation_batches(self.held_back, count=shapes, workers=workers, **self._loading)
         with contextlib.closing(some):
@@ -243,7 +218,7 @@ class Run:
             )
 
     def evaluate(self) -> bool:
-        """The evaluation that is due; False where a stop was asked for."""
+        """Evaluate, log it, note the best; False where a stop was asked for."""
         progress, begun = self.progress, self.seconds()
         found = self.measure(self.config.run.evaluate_shapes, self.config.run.pictures if self.rank == 0 else 0)
         if found is None:
@@ -258,10 +233,7 @@ class Run:
         return True
 
     def plan(self) -> bool:
-        """Set the number of steps that fill the CPU minutes; False where a stop was asked for.
-
-        It follows from the time of a step and of an evaluation.
-        """
+        """Set the number of steps that fill the CPU minutes, from measured times; False where a stop was asked for."""
         settings, progress = self.config.run, self.progress
         assert settings.cpu_minutes is not None
         by_views: dict[float, list[float]] = {}

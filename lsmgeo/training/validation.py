@@ -1,4 +1,4 @@
-"""How good a model is in the middle of its training: always the same shapes, with always the same views."""
+"""Evaluation during training: always on the same shapes, with the same views."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ __all__ = ["Evaluation", "evaluate_model"]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What an evaluation found.
+    """The result of an evaluation.
 
     Attributes:
         measure: "iou" (at 0.4, of voxels) or "depth_error" (median, world units).
         by_view: the mean of the categories after 1 to V views.
         categories: of each category, after V views.
         loss: as in training, after every view.
-        examples: the first shapes with what was predicted of them.
+        examples: the first shapes with their predictions.
     """
 
     measure: str
@@ -45,25 +45,25 @@ class Evaluation:
 
     @property
     def title(self) -> str:
-        """What the measure is called."""
+        """The name of the measure, for people."""
         return "IoU" if self.measure == "iou" else self.measure.replace("_", " ")
 
     @property
     def words(self) -> str:
-        """The measure by the number of views, as people read it."""
+        """The measure by the number of views, for people."""
         values = self.by_view.values()
         shown = [f"{100 * value:.1f}" if self.measure == "iou" else f"{value:.4f}" for value in values]
         unit = " %" if self.measure == "iou" else ""
         return f"{', '.join(shown)}{unit} after 1 to {len(shown)} views"
 
     def is_better_than(self, value: float | None) -> bool:
-        """Whether the measure is better than a value; any is better than none, and than NaN."""
+        """Whether the measure is better than a value; every measure is better than None or NaN."""
         if value is None or math.isnan(value):
             return True
         return self.value > value if self.measure == "iou" else self.value < value
 
     def fields(self) -> dict[str, Any]:
-        """What the log holds of it."""
+        """Its fields in the log."""
         return {self.measure: self.by_view, "per_category": self.categories, "loss": self.loss}
 
 
@@ -75,13 +75,13 @@ def evaluate_model(
     Args:
         model: its mode is restored in the end.
         batches: every shape with V views.
-        stop: when it is asked for, in whichever process, nothing is measured.
+        stop: when it is asked for, in any process, nothing is measured.
         region: of the loss of depth.
         loss: of voxels.
-        images: how many shapes to keep with what is predicted of them.
+        images: how many shapes to keep with their predictions.
 
     Returns:
-        What was found, in all processes the same but for the examples; None where a stop was asked for.
+        The same in all processes except for the examples; None where a stop was asked for.
     """
     measures: dict[int, Any] = {}
     total = count = 0.0
@@ -106,7 +106,7 @@ def evaluate_model(
     if any_true(bool(stop)):
         return None
     parts = gather((measures, total, count))
-    together, *others = [part[0] for part in parts if part[0]]  # a process may have had no shape
+    together, *others = [part[0] for part in parts if part[0]]  # a process may have no shape
     for other in others:
         for view, measure in other.items():
             together[view].merge(measure)

@@ -224,7 +224,7 @@ def test_another_size_of_images_keeps_the_geometry(size):
         ({"categories": ("chairs",)}, VOXELS, "categories: no shape is of"),
         ({"split": "training"}, VOXELS, "split: no shape is of"),
         ({"source": "synthetic-13", "categories": "chairs", "views": 1}, VOXELS, "categories must be of airplane"),
-        ({"source": "synthetic-13", "shapes": 1, "views": 1}, VOXELS, "none is of split 'train'"),
+        ({"source": "synthetic-13", "shapes": 1, "views": 1}, VOXELS, "of synthetic-13 is of split 'train'"),
         ({"views": 9}, VOXELS, "views; 9 are asked for"),
     ],
 )
@@ -237,5 +237,5 @@ def test_what_a_set_lacks_is_told_at_once(shards, changes, need, message):
 
 def test_shards_without_depth_are_told(tmp_path):
     render_set("synthetic-13", tmp_path, Recipe(0, 1, 16, (16,), depth=False), shapes=13, jobs=1)
-    with pytest.raises(OptionError, match="data: source has no depth, which the model is trained with"):
+    with pytest.raises(OptionError, match="data: source has no depth, which the model needs"):
         opened(DataConfig(source=str(tmp_path), views=1), DEPTH)

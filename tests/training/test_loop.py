@@ -112,7 +112,7 @@ def test_the_loss_of_some_views(shards, tmp_path, loss_views):
     model = create("voxel-lsm", preset="tiny", **config.model.settings)
     drawn, expected, of_every = [], [], []
     for step, batch in enumerate(first_batches(config, 4)):
-        drawn.append(-1 if loss_views == "last" else optim.loss_steps(config.run, step, 2)[0])
+        drawn.append(-1 if loss_views == "last" else optim.loss_views_of(config.run, step, 2)[0])
         with torch.no_grad():
             output = model(batch.images, batch.cameras, batch.view_mask)
         # A scene of one view tells at the end what it told after the first.
@@ -204,7 +204,7 @@ def test_the_loss_of_depth_after_a_random_view_is_that_of_the_views_so_far(tmp_p
     expected, drawn = [], []
     with contextlib.closing(training_batches(shapes, seed=3, **options)) as batches:
         for step, batch in enumerate(itertools.islice(batches, 4)):
-            views = optim.loss_steps(config.run, step, 3)[0] + 1
+            views = optim.loss_views_of(config.run, step, 3)[0] + 1
             cameras = CameraTensors(*(field[:, :views] for field in batch.cameras))
             with torch.no_grad():
                 depth = model(batch.images[:, :views], cameras, steps="last").depth[:, 0]

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lsmgeo.training import loop
-from lsmgeo.training.optim import loss_steps
+from lsmgeo.training.optim import loss_views_of
 from tests.training.faults import in_processes
 from tests.training.runs import assert_same_learning, configure, end_of, events, run
 
@@ -36,7 +36,7 @@ def test_two_processes_plan_together_and_take_steps_of_one_view(shards, tmp_path
         data=dataclasses.replace(config.data, views=2),
         run=dataclasses.replace(config.run, loss_views="random"),
     )
-    assert {tuple(loss_steps(config.run, step, 2)) for step in range(6)} == {(0,), (1,)}
+    assert {tuple(loss_views_of(config.run, step, 2)) for step in range(6)} == {(0,), (1,)}
     assert in_processes(lambda rank: run(config, tmp_path)) == [0, 0]
     assert [line["steps"] for line in events(tmp_path, "plan")] == [31]
     assert end_of(tmp_path)[0] == 31

@@ -6,7 +6,7 @@ They are optional: without a C++ compiler the package installs and runs on PyTor
 from setuptools import Extension, setup
 
 NATIVE = "lsmgeo/kernels/native"
-HEADERS = ("call", "resample", "vectors", "places", "forward", "backward")
+HEADERS = ("call", "resample", "simd", "sampling", "forward", "backward")
 
 setup(
     ext_modules=[

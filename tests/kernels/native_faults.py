@@ -1,4 +1,4 @@
-"""Faults in the C++ kernels: each a substitution in their source. One library has all and makes the one it is told."""
+"""Faults in the C++ kernels: each a substitution in their source. One library has them all and makes one at a time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import lsmgeo
 
 SOURCES = Path(lsmgeo.__file__).parent / "kernels" / "native"
 
-# name: (what stands in the source, what is put in the place of the expression between the dollars)
+# name: (a line of the source, the replacement of the expression between the dollars)
 FAULTS = {
     "half a pixel": ("const float index = $tile.index[axis][s]$;", "tile.index[axis][s] + 0.5f"),
     "x and y swapped": ("tile.index[0][s] = front ? ($slope[0]$", "slope[1]"),
@@ -25,9 +25,9 @@ FAULTS = {
     "slope beyond the border": ("$index > 0.0f && index < size - 1.0f ? 1.0f : 0.0f$", "1.0f"),
     "weights of x and y swapped": ("tile.weight[1][s] = $x * near$;", "(1.0f - x) * next"),
     "last tap dropped": ("tile.weight[7][s] = $x * y * z$;", "0.0f"),
-    "edge taps not weighted": ("const float weight = $weight_of<DIMS>(tile, s, tap) * factor$;", "factor"),
-    "one channel's tap astray": ("places[2][s] = $corner + down$;", "corner"),
-    "one channel's unread sites": ("values[s] = $tile.reads[s] ? values[s] : 0.0f$;", "values[s]"),
+    "edge taps not weighted": ("const float weight = $tap_weight<DIMS>(tile, s, tap) * factor$;", "factor"),
+    "one channel's tap astray": ("offsets[2][s] = $corner + down$;", "corner"),
+    "one channel's unread sites": ("values[s] = $tile.in_range[s] ? values[s] : 0.0f$;", "values[s]"),
     "one channel's rest forgotten": ("$s < padded$; s += LANES", "s + LANES <= n"),
     "tiles at the volume's edge passed over": (
         "if ($index[axis][0] < -1.01 && index[axis][1] < -1.01$) return true;",
@@ -38,23 +38,29 @@ FAULTS = {
         "slope[tap][axis] = $tap >> axis & 1 ? rest : -rest$;",
         "tap >> axis & 1 ? -rest : rest",
     ),
-    "depth without its slope": ("rows[2][s] += $float(by_height)$;", "0.0f"),
+    "depth without its slope": ("rows[2][s] += $float(grad_height)$;", "0.0f"),
     "height's part forgotten": ("rows[2][s] = -($rows[0][s]$ * tile.index[0][s]", "0.0f"),
-    "inverse depth's part forgotten": ("by_z[s] -= $double(by_plane) * tile.plane[row][s] * tile.depth[s]$;", "0.0"),
-    "direction's slope not projected": (
-        "($by_direction[row][s] - along * tile.direction[row][s]$)",
-        "by_direction[row][s]",
+    "inverse depth's part forgotten": (
+        "grad_z[s] -= $double(grad_plane) * tile.plane[row][s] * tile.depth[s]$;",
+        "0.0",
     ),
-    "direction not normalised": ("tile.shrink[s] = $away ? 1.0f / std::sqrt(away ? squares : 1.0f) : 0.0f$;", "1.0f"),
+    "direction's slope not projected": (
+        "($grad_direction[row][s] - along * tile.direction[row][s]$)",
+        "grad_direction[row][s]",
+    ),
+    "direction not normalised": (
+        "tile.inverse_length[s] = $away ? 1.0f / std::sqrt(away ? squares : 1.0f) : 0.0f$;",
+        "1.0f",
+    ),
     "direction in y, z, x order": ("*out++ = $tile.direction[row][s]$;", "tile.direction[(row + 1) % 3][s]"),
-    "mean over all views": ("mean += read<W>(values + v * step) * $share$;", "0.3333333f"),
+    "mean over all views": ("mean += load<W>(values + v * step) * $share$;", "0.3333333f"),
     "blind views counted": ("if ($!tiles[v].visible[s]$) continue;\n        float *out", "false"),
-    "unbiased variance": ("result += apart * apart * $share$;", "1.0f / float(count > 1 ? count - 1 : 1)"),
-    "maximum's gradient to all views": ("part = $taker == int32_t(v) ? gradient : Floats<W>{}$;", "gradient"),
+    "unbiased variance": ("result += deviation * deviation * $share$;", "1.0f / float(count > 1 ? count - 1 : 1)"),
+    "maximum's gradient to all views": ("part = $argmax == int32_t(v) ? gradient : Floats<W>{}$;", "gradient"),
     "mean's gradient not shared": ("Floats<W> part = gradient * $share$;", "1.0f"),
-    "first chunk's channels for all": ("const S *source = source_of<S>(call, scene, view) + $channel$;", "0"),
+    "first chunk's channels for all": ("const S *source = source_pointer<S>(call, scene, view) + $channel$;", "0"),
     "depths that saturate differentiated": (
-        "geometric.by_distance[s] = $distance < LARGEST && distance <= limit ? *gradient : 0.0f$;",
+        "site_gradients.grad_distance[s] = $distance < LARGEST && distance <= limit ? *gradient : 0.0f$;",
         "*gradient",
     ),
     "given channels that saturate differentiated": (
@@ -62,7 +68,7 @@ FAULTS = {
         "*gradient",
     ),
     "statistics that saturate differentiated": (
-        "gradient = $held_lanes<W>(result, limit) == result ? gradient : Floats<W>{}$;",
+        "gradient = $clamped_lanes<W>(result, limit) == result ? gradient : Floats<W>{}$;",
         "gradient",
     ),
     "gradient not cleared": ("if ($!call.source_gradient || call.accumulate$) return;", "true"),
@@ -79,15 +85,17 @@ def compiler() -> str | None:
 
 
 def with_faults(text: str, found: set[str]) -> str:
-    """A source in which ``lsmgeo_fault`` decides between what stands there and each fault; adds the faults' names."""
+    """A source in which ``lsmgeo_fault`` decides between the code and each fault; adds the faults' names."""
     places = []
-    for name, (there, instead) in FAULTS.items():
-        before, sound, after = there.split("$")
+    for name, (original, replacement) in FAULTS.items():
+        before, sound, after = original.split("$")
         start = text.find(before + sound + after)
         if start >= 0:
             found.add(name)
             start += len(before)
-            places.append((start, start + len(sound), f"(lsmgeo_fault == {NUMBERS[name]} ? ({instead}) : ({sound}))"))
+            places.append(
+                (start, start + len(sound), f"(lsmgeo_fault == {NUMBERS[name]} ? ({replacement}) : ({sound}))")
+            )
     last = len(text)
     for start, end, switch in sorted(places, reverse=True):
         assert end <= last, f"faults overlap in {text[start:end]!r}"

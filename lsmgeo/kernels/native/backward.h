@@ -1,27 +1,28 @@
-// The transposes of what forward.h does, with the gradients by place. Included by resample.h.
+// The transposes of forward.h, and the gradients to the geometry. Included by resample.h.
 
-// Sums over a tile of what its sites say about the matrices and z; gradients by M q, by G q and by the place in z.
-struct Sums {
+// Gradients to a view's matrices M and G and to z, summed over its sites.
+struct GeometryGradients {
     double *matrix, *direction, *z;
 };
 
-// By (M q) / z for images and by (M q) / s for volumes, both with respect to the terms of M q.
-inline void collect(const Plan &plan, const Tile &tile, const float (*by_index)[TILE], const float *by_distance,
-                    const float (*by_direction)[TILE], const Sums &sums) {
+// From the gradients to the index, (M q) / z for images and (M q) / s for volumes, to the depth and to the direction.
+inline void accumulate_geometry_gradients(const Plan &plan, const Tile &tile, const float (*grad_index)[TILE],
+                                          const float *grad_distance, const float (*grad_direction)[TILE],
+                                          const GeometryGradients &sums) {
     const Call &call = *plan.call;
     const View &view = view_of(plan, tile);
-    const int n = int(tile.number);
+    const int n = int(tile.count);
     const double y = call.y[tile.j];
-    double by_z[TILE] = {};  // by z, at each site; depths and slopes may be far apart
+    double grad_z[TILE] = {};  // at each site; depths and slopes may be far apart
     double extra_z = 0.0;
-    const bool volumes = call.kind == VOLUMES;
+    const bool volumes = call.kind == PLANE_SWEEP_PROJECT;
     if (!volumes) {
         const double z = plane_z(call, tile, tile.k);
         const double unit = (call.projective ? z : 1.0) * view.scale;
         float rows[3][TILE];
         for (int s = 0; s < n; s++) {
-            rows[0][s] = by_index[0][s] * tile.inverse[s];
-            rows[1][s] = by_index[1][s] * tile.inverse[s];
+            rows[0][s] = grad_index[0][s] * tile.inverse[s];
+            rows[1][s] = grad_index[1][s] * tile.inverse[s];
             rows[2][s] = 0.0f;
         }
         for (int s = 0; s < n; s++)
@@ -29,9 +30,9 @@ inline void collect(const Plan &plan, const Tile &tile, const float (*by_index)[
                 rows[2][s] = -(rows[0][s] * tile.index[0][s] + rows[1][s] * tile.index[1][s]);
         if (call.depth && !view.masked)
             for (int s = 0; s < n; s++) {
-                const double by_height = by_distance[s] / unit;
-                rows[2][s] += float(by_height);
-                if (call.projective) extra_z -= by_height * double(tile.distance[s]) * view.scale;
+                const double grad_height = grad_distance[s] / unit;
+                rows[2][s] += float(grad_height);
+                if (call.projective) extra_z -= grad_height * double(tile.distance[s]) * view.scale;
             }
         for (int row = 0; row < 3; row++) {
             float sum = 0.0f, sum_x = 0.0f;
@@ -52,12 +53,12 @@ inline void collect(const Plan &plan, const Tile &tile, const float (*by_index)[
         for (int row = 0; row < 3; row++) {
             float sum = 0.0f, sum_x = 0.0f, sum_offset = 0.0f;
             for (int s = 0; s < n; s++) {
-                const float by_plane = by_index[row][s] * tile.depth[s];
-                const float free = std::fabs(tile.plane[row][s]) < LARGEST_COORDINATE ? by_plane : 0.0f;
-                sum += free;
-                sum_x += free * tile.x[s];
-                sum_offset += by_index[row][s];
-                by_z[s] -= double(by_plane) * tile.plane[row][s] * tile.depth[s];
+                const float grad_plane = grad_index[row][s] * tile.depth[s];
+                const float unclamped = std::fabs(tile.plane[row][s]) < LARGEST_COORDINATE ? grad_plane : 0.0f;
+                sum += unclamped;
+                sum_x += unclamped * tile.x[s];
+                sum_offset += grad_index[row][s];
+                grad_z[s] -= double(grad_plane) * tile.plane[row][s] * tile.depth[s];
             }
             if (sums.matrix) {
                 double *to = sums.matrix + 4 * row;
@@ -68,15 +69,15 @@ inline void collect(const Plan &plan, const Tile &tile, const float (*by_index)[
             }
         }
         if (call.depth && !view.masked)
-            for (int s = 0; s < n; s++) by_z[s] -= double(by_distance[s]) * tile.depth[s] * tile.depth[s];
+            for (int s = 0; s < n; s++) grad_z[s] -= double(grad_distance[s]) * tile.depth[s] * tile.depth[s];
     }
     if (call.direction && !view.masked) {
         float rows[3][TILE];
         for (int s = 0; s < n; s++) {
             float along = 0.0f;
-            for (int row = 0; row < 3; row++) along += by_direction[row][s] * tile.direction[row][s];
+            for (int row = 0; row < 3; row++) along += grad_direction[row][s] * tile.direction[row][s];
             for (int row = 0; row < 3; row++)
-                rows[row][s] = (by_direction[row][s] - along * tile.direction[row][s]) * tile.shrink[s];
+                rows[row][s] = (grad_direction[row][s] - along * tile.direction[row][s]) * tile.inverse_length[s];
         }
         for (int row = 0; row < 3; row++) {
             const double inner = view.direction[row][2];
@@ -85,7 +86,7 @@ inline void collect(const Plan &plan, const Tile &tile, const float (*by_index)[
                 sum += rows[row][s];
                 sum_x += double(rows[row][s]) * tile.x[s];
                 sum_z += double(rows[row][s]) * plane_z(call, tile, tile.k + (tile.along_z ? s : 0));
-                by_z[s] += rows[row][s] * inner;
+                grad_z[s] += rows[row][s] * inner;
             }
             if (sums.direction) {
                 double *to = sums.direction + 4 * row;
@@ -98,24 +99,25 @@ inline void collect(const Plan &plan, const Tile &tile, const float (*by_index)[
     }
     if (sums.z) {
         sums.z[tile.k] += extra_z;
-        for (int s = 0; s < n; s++) sums.z[tile.k + (tile.along_z ? s : 0)] += by_z[s];
+        for (int s = 0; s < n; s++) sums.z[tile.k + (tile.along_z ? s : 0)] += grad_z[s];
     }
 }
 
-// The parts of the incoming gradient that belong to geometric channels, site by site: 0 where they saturate.
-struct Geometric {
-    float by_index[3][TILE], by_distance[TILE], by_direction[3][TILE];
+// Gradients to the index and to the geometric channels of each site, 0 where these saturate.
+struct SiteGradients {
+    float grad_index[3][TILE], grad_distance[TILE], grad_direction[3][TILE];
 };
 
-inline void split(const Call &call, const Tile &tile, int s, const float *gradient, Geometric &geometric) {
+inline void load_extra_gradients(const Call &call, const Tile &tile, int s, const float *gradient,
+                                 SiteGradients &site_gradients) {
     const float limit = call.statistics ? LARGEST : saturation_limit(call.gradient_type);
     if (call.depth) {
         const float distance = std::fabs(tile.distance[s]);
-        geometric.by_distance[s] = distance < LARGEST && distance <= limit ? *gradient : 0.0f;
+        site_gradients.grad_distance[s] = distance < LARGEST && distance <= limit ? *gradient : 0.0f;
         gradient++;
     }
     if (call.direction)
-        for (int row = 0; row < 3; row++) geometric.by_direction[row][s] = *gradient++;
+        for (int row = 0; row < 3; row++) site_gradients.grad_direction[row][s] = *gradient++;
     if (call.extra && call.extras_gradient) {
         const int64_t site = (tile.scene * call.views + tile.view) * call.sites[0] + tile.i + s;
         for (int64_t at = site * call.extra; at < (site + 1) * call.extra; at++, gradient++)
@@ -123,9 +125,9 @@ inline void split(const Call &call, const Tile &tile, int s, const float *gradie
     }
 }
 
-inline void clear(const Call &call, int64_t scene, int64_t view, int64_t channel, int64_t channels) {
+inline void clear_source_gradient(const Call &call, int64_t scene, int64_t view, int64_t channel, int64_t channels) {
     if (!call.source_gradient || call.accumulate) return;
-    float *first = gradient_of(call, scene, view) + channel;
+    float *first = gradient_pointer(call, scene, view) + channel;
     const int64_t *stride = call.source_gradient_stride;
     for (int64_t z = 0; z < call.size[2]; z++)
         for (int64_t y = 0; y < call.size[1]; y++)
@@ -133,67 +135,71 @@ inline void clear(const Call &call, int64_t scene, int64_t view, int64_t channel
                 std::memset(first + z * stride[2] + y * stride[3] + x * stride[4], 0, size_t(channels) * sizeof(float));
 }
 
-inline Sums sums_of(const Call &call, int64_t scene, int64_t view, int64_t chunk) {
+inline GeometryGradients geometry_gradients(const Call &call, int64_t scene, int64_t view, int64_t chunk) {
     const int64_t at = (scene * call.views + view) * call.chunks + chunk;
     return {call.matrix_gradient ? call.matrix_gradient + 12 * at : nullptr,
             call.direction_gradient ? call.direction_gradient + 12 * at : nullptr,
             call.z_gradient ? call.z_gradient + call.sites[2] * at : nullptr};
 }
 
-inline void finish(const Plan &plan, const Tile &tile, int64_t chunk, const Geometric &geometric) {
+inline void store_geometry_gradients(const Plan &plan, const Tile &tile, int64_t chunk,
+                                     const SiteGradients &site_gradients) {
     const Call &call = *plan.call;
-    if (call.kind != PIXELS) {
-        const Sums sums = sums_of(call, tile.scene, tile.view, chunk);
+    if (call.kind != SAMPLE_VIEWS) {
+        const GeometryGradients sums = geometry_gradients(call, tile.scene, tile.view, chunk);
         if (sums.matrix || sums.direction || sums.z)
-            collect(plan, tile, geometric.by_index, geometric.by_distance, geometric.by_direction, sums);
+            accumulate_geometry_gradients(plan, tile, site_gradients.grad_index, site_gradients.grad_distance,
+                                          site_gradients.grad_direction, sums);
     } else if (call.pixels_gradient) {
         const int64_t at = ((chunk * call.scenes + tile.scene) * call.views + tile.view) * call.sites[0] + tile.i;
-        for (int64_t s = 0; s < tile.number; s++)
+        for (int64_t s = 0; s < tile.count; s++)
             for (int axis = 0; axis < 2; axis++)
-                call.pixels_gradient[2 * (at + s) + axis] = geometric.by_index[axis][s];
+                call.pixels_gradient[2 * (at + s) + axis] = site_gradients.grad_index[axis][s];
     }
 }
 
-// Backward of `sample`: all sites of one view, one chunk of the channels. The last has the geometric channels too.
+// Backward of `sample`: all sites of one view, one chunk of the channels. The last also has the geometric channels.
 template <int DIMS, class S>
-void sample_backward(const Plan &plan, int64_t scene, int64_t view, int64_t chunk, Room &room) {
+void sample_backward(const Plan &plan, int64_t scene, int64_t view, int64_t chunk, Workspace &workspace) {
     const Call &call = *plan.call;
-    Tile &tile = *static_cast<Tile *>(room.tiles);
+    Tile &tile = *static_cast<Tile *>(workspace.tiles);
     int64_t axes[3], to_axes[3];
     axis_strides(call.source_stride, axes);
     axis_strides(call.source_gradient_stride, to_axes);
     const int64_t channel = chunk * call.channels / call.chunks;
     const int64_t channels = (chunk + 1) * call.channels / call.chunks - channel;
     const int64_t appended = plan.channels - call.channels;
-    const bool geometry = chunk + 1 == call.chunks && appended > 0;
-    const bool places = call.matrix_gradient || call.z_gradient || call.pixels_gradient;
-    const S *source = source_of<S>(call, scene, view) + channel;
-    float *to = call.source_gradient ? gradient_of(call, scene, view) + channel : nullptr;
-    Geometric geometric = {};
-    if (DIMS == 2) clear(call, scene, view, channel, channels);
+    const bool has_extra = chunk + 1 == call.chunks && appended > 0;
+    const bool needs_index = call.matrix_gradient || call.z_gradient || call.pixels_gradient;
+    const S *source = source_pointer<S>(call, scene, view) + channel;
+    float *to = call.source_gradient ? gradient_pointer(call, scene, view) + channel : nullptr;
+    SiteGradients site_gradients = {};
+    if (DIMS == 2) clear_source_gradient(call, scene, view, channel, channels);
     for (int64_t number = 0; number < plan.tiles; number++) {
-        start(plan, tile, scene, view, number);
+        start_tile(plan, tile, scene, view, number);
         locate<DIMS>(call, view_of(plan, tile), tile);
-        const Block block = take(call, tile, channel, channels, room.values);
-        for (int s = 0; s < int(tile.number); s++) {
+        const Block block = load_gradient(call, tile, channel, channels, workspace.values);
+        for (int s = 0; s < int(tile.count); s++) {
             const float *gradient = block.first + s * block.step;
-            if (places) place_gradient<DIMS>(call, tile, s, source, axes, channels, gradient, geometric.by_index);
+            if (needs_index)
+                index_gradient<DIMS>(call, tile, s, source, axes, channels, gradient, site_gradients.grad_index);
             if (to) scatter<DIMS>(call, tile, s, to, to_axes, channels, gradient);
         }
-        if (geometry) {
-            const Block last = take(call, tile, call.channels, appended, room.values);
-            for (int s = 0; s < int(tile.number); s++) split(call, tile, s, last.first + s * last.step, geometric);
+        if (has_extra) {
+            const Block last = load_gradient(call, tile, call.channels, appended, workspace.values);
+            for (int s = 0; s < int(tile.count); s++)
+                load_extra_gradients(call, tile, s, last.first + s * last.step, site_gradients);
         }
-        finish(plan, tile, chunk, geometric);
+        store_geometry_gradients(plan, tile, chunk, site_gradients);
     }
 }
 
-// From the gradient by the statistics of one site to that by the values of each view that sees it.
-inline void unsummarise(const Call &call, const float *values, int64_t count, int64_t channels,
+// From the gradients to the statistics of one site to those to the values of each view that sees it.
+inline void statistics_backward(const Call &call, const float *values, int64_t count, int64_t channels,
                         const float *const *gradients, float *out) {
     if (count == 0) return;
     const float share = 1.0f / float(count), limit = saturation_limit(call.gradient_type);
-    // No statistic is above the limit where no value is above its root.
+    // No statistic exceeds the limit where no value exceeds its root.
     int32_t is_large = 0;
     if (limit < LARGEST) {
         const float root = std::sqrt(limit);
@@ -203,44 +209,47 @@ inline void unsummarise(const Call &call, const float *values, int64_t count, in
         constexpr int W = decltype(width)::value;
         const float *first = values + c;
         for (int64_t block = 0; block < call.statistics; block++) {
-            Floats<W> gradient = read<W>(gradients[block] + c), mean = {}, best, total = {};
+            Floats<W> gradient = load<W>(gradients[block] + c), mean = {}, best, total = {};
             const int64_t kind = call.statistic[block];
-            Masks<W> taker = {}, held = {};
-            if (kind == MAX) taker = best_of<W>(first, count, channels, best);
+            Masks<W> argmax = {}, any_clamped = {};
+            if (kind == MAX) argmax = max_of<W>(first, count, channels, best);
             if (kind == VARIANCE || (kind == MEAN && is_large)) mean = mean_of<W>(first, count, channels);
             if (is_large) {
                 const Floats<W> result =
                     kind == MAX ? best : kind == MEAN ? mean : variance_of<W>(first, count, channels, mean);
-                gradient = held_lanes<W>(result, limit) == result ? gradient : Floats<W>{};
+                gradient = clamped_lanes<W>(result, limit) == result ? gradient : Floats<W>{};
             }
             for (int64_t v = 0; v < count; v++) {
                 Floats<W> part = gradient * share;
                 if (kind == VARIANCE) {
-                    const Floats<W> apart = read<W>(first + v * channels) - mean;
-                    const Masks<W> is_held = held_lanes<W>(apart, LARGEST_ROOT) != apart;
-                    part = is_held ? Floats<W>{} : 2.0f * part * apart;
+                    const Floats<W> deviation = load<W>(first + v * channels) - mean;
+                    const Masks<W> is_clamped = clamped_lanes<W>(deviation, LARGEST_ROOT) != deviation;
+                    part = is_clamped ? Floats<W>{} : 2.0f * part * deviation;
                     total += part;
-                    held |= is_held;
+                    any_clamped |= is_clamped;
                 } else if (kind == MAX) {
-                    part = taker == int32_t(v) ? gradient : Floats<W>{};
+                    part = argmax == int32_t(v) ? gradient : Floats<W>{};
                 }
                 float *to = out + v * channels + c;
-                write<W>(to, block == 0 ? part : part + read<W>(to));
+                store<W>(to, block == 0 ? part : part + load<W>(to));
             }
-            if (!is_any<W>(held)) continue;
-            // Through the mean: 0 but for rounding, unless deviations are held.
-            const Floats<W> drift = held ? total * share : Floats<W>{};
-            for (int64_t v = 0; v < count; v++) write<W>(out + v * channels + c, read<W>(out + v * channels + c) - drift);
+            if (!any_lane<W>(any_clamped)) continue;
+            // Through the mean: 0 but for rounding, unless deviations are clamped.
+            const Floats<W> drift = any_clamped ? total * share : Floats<W>{};
+            for (int64_t v = 0; v < count; v++) {
+                float *to = out + v * channels + c;
+                store<W>(to, load<W>(to) - drift);
+            }
         }
     });
 }
 
 // Backward of `reduce`: all sites of one scene, one chunk of the channels.
 template <class S>
-void reduce_backward(const Plan &plan, int64_t scene, int64_t chunk, Room &room) {
+void reduce_backward(const Plan &plan, int64_t scene, int64_t chunk, Workspace &workspace) {
     const Call &call = *plan.call;
-    Tile *tiles = static_cast<Tile *>(room.tiles);
-    Geometric *geometric = static_cast<Geometric *>(room.geometric);
+    Tile *tiles = static_cast<Tile *>(workspace.tiles);
+    SiteGradients *site_gradients = static_cast<SiteGradients *>(workspace.site_gradients);
     int64_t axes[3], to_axes[3];
     axis_strides(call.source_stride, axes);
     axis_strides(call.source_gradient_stride, to_axes);
@@ -248,61 +257,63 @@ void reduce_backward(const Plan &plan, int64_t scene, int64_t chunk, Room &room)
     const int64_t channels = (chunk + 1) * call.channels / call.chunks - channel;
     const int64_t appended = chunk + 1 == call.chunks ? plan.channels - call.channels : 0;
     const int64_t width = channels + appended;
-    const bool places = call.matrix_gradient || call.z_gradient || call.pixels_gradient;
+    const bool needs_index = call.matrix_gradient || call.z_gradient || call.pixels_gradient;
     const bool only_mean = call.statistics == 1 && call.statistic[0] == MEAN;
     for (int64_t v = 0; v < call.views; v++) {
-        clear(call, scene, v, channel, channels);
-        geometric[v] = Geometric{};
+        clear_source_gradient(call, scene, v, channel, channels);
+        site_gradients[v] = SiteGradients{};
     }
     for (int64_t number = 0; number < plan.tiles; number++) {
         for (int64_t v = 0; v < call.views; v++) {
-            start(plan, tiles[v], scene, v, number);
+            start_tile(plan, tiles[v], scene, v, number);
             locate<2>(call, view_of(plan, tiles[v]), tiles[v]);
         }
         Block blocks[3];
         for (int64_t block = 0; block < call.statistics; block++) {
-            // The last chunk's channels and the geometric ones follow one another.
-            float *to = room.reduced + block * TILE * width;
-            blocks[block] = take(call, tiles[0], block * plan.channels + channel, width, to);
+            // The geometric channels follow those of the last chunk.
+            float *to = workspace.reduced + block * TILE * width;
+            blocks[block] = load_gradient(call, tiles[0], block * plan.channels + channel, width, to);
         }
-        for (int s = 0; s < int(tiles[0].number); s++) {
+        for (int s = 0; s < int(tiles[0].count); s++) {
             int64_t count;
-            if (only_mean && !places && appended == 0) {
+            if (only_mean && !needs_index && appended == 0) {
                 if (!call.source_gradient) continue;
                 count = 0;
                 for (int64_t v = 0; v < call.views; v++)
-                    if (tiles[v].visible[s]) room.seen[count++] = v;
+                    if (tiles[v].visible[s]) workspace.visible_views[count++] = v;
                 const float share = 1.0f / float(count > 0 ? count : 1);
                 const float *gradient = blocks[0].first + s * blocks[0].step;
-                for (int64_t seen = 0; seen < count; seen++) {
-                    const int64_t v = room.seen[seen];
-                    float *to = gradient_of(call, scene, v) + channel;
+                for (int64_t number = 0; number < count; number++) {
+                    const int64_t v = workspace.visible_views[number];
+                    float *to = gradient_pointer(call, scene, v) + channel;
                     scatter<2>(call, tiles[v], s, to, to_axes, channels, gradient, share);
                 }
                 continue;
             }
-            count = visible_values<S>(plan, tiles, s, channel, channels, appended > 0, room);
+            count = gather_visible<S>(plan, tiles, s, channel, channels, appended > 0, workspace);
             const float *gradients[3];
             for (int64_t block = 0; block < call.statistics; block++)
                 gradients[block] = blocks[block].first + s * blocks[block].step;
-            unsummarise(call, room.values, count, width, gradients, room.spread);
-            for (int64_t v = 0, seen = 0; v < call.views; v++) {
-                const bool visible = seen < count && room.seen[seen] == v;
-                const float *gradient = visible ? room.spread + seen * width : room.nothing;
-                seen += visible;
-                if (appended) split(call, tiles[v], s, gradient + (visible ? channels : 0), geometric[v]);
-                if (places)
-                    for (int axis = 0; axis < 2; axis++) geometric[v].by_index[axis][s] = 0.0f;
+            statistics_backward(call, workspace.values, count, width, gradients, workspace.value_gradients);
+            for (int64_t v = 0, next = 0; v < call.views; v++) {
+                const bool visible = next < count && workspace.visible_views[next] == v;
+                const float *gradient = visible ? workspace.value_gradients + next * width : workspace.zeros;
+                next += visible;
+                if (appended)
+                    load_extra_gradients(call, tiles[v], s, gradient + (visible ? channels : 0), site_gradients[v]);
+                if (needs_index)
+                    for (int axis = 0; axis < 2; axis++) site_gradients[v].grad_index[axis][s] = 0.0f;
                 if (!visible) continue;
-                if (places) {
-                    const S *source = source_of<S>(call, scene, v) + channel;
-                    place_gradient<2>(call, tiles[v], s, source, axes, channels, gradient, geometric[v].by_index);
+                if (needs_index) {
+                    const S *source = source_pointer<S>(call, scene, v) + channel;
+                    index_gradient<2>(call, tiles[v], s, source, axes, channels, gradient,
+                                      site_gradients[v].grad_index);
                 }
                 if (!call.source_gradient) continue;
-                float *to = gradient_of(call, scene, v) + channel;
+                float *to = gradient_pointer(call, scene, v) + channel;
                 scatter<2>(call, tiles[v], s, to, to_axes, channels, gradient);
             }
         }
-        for (int64_t v = 0; v < call.views; v++) finish(plan, tiles[v], chunk, geometric[v]);
+        for (int64_t v = 0; v < call.views; v++) store_geometry_gradients(plan, tiles[v], chunk, site_gradients[v]);
     }
 }

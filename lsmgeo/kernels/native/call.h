@@ -1,9 +1,9 @@
-// What Python hands over, and what is made of it once a call. Plain C layout: lsmgeo/kernels/cpu.py mirrors `Call`.
+// The arguments of a call. Plain C layout: lsmgeo/kernels/native/library.py mirrors `Call`.
 #pragma once
 
 #include <cstdint>
 
-enum Kind : int64_t { IMAGES = 0, PIXELS = 1, VOLUMES = 2 };
+enum Kind : int64_t { UNPROJECT = 0, SAMPLE_VIEWS = 1, PLANE_SWEEP_PROJECT = 2 };
 enum Type : int64_t { FLOAT32 = 0, BFLOAT16 = 1, FLOAT16 = 2 };
 enum Statistic : int64_t { MEAN = 0, VARIANCE = 1, MAX = 2 };
 

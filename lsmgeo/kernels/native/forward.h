@@ -1,4 +1,4 @@
-// Values of blocks of sites, of views and of their statistics. Included by resample.h.
+// Values of views and their statistics, tile by tile. Included by resample.h.
 
 // Blocks of values
 
@@ -25,7 +25,7 @@ inline void store_block(S *values, const Layout &at, int64_t sites, int64_t chan
     }
 }
 
-inline void put(const Call &call, const Layout &at, int64_t sites, int64_t channels, const float *block) {
+inline void store_tile(const Call &call, const Layout &at, int64_t sites, int64_t channels, const float *block) {
     if (call.values_type == FLOAT32 && at.site == 1)
         transpose(block, channels, static_cast<float *>(call.values) + at.base, at.channel, sites, channels);
     else if (call.values_type == FLOAT32) store_block(static_cast<float *>(call.values), at, sites, channels, block);
@@ -39,44 +39,44 @@ inline void load_block(const S *values, const Layout &at, int64_t sites, int64_t
     const S *first = values + at.base;
     if (at.channel == 1)
         for (int64_t s = 0; s < sites; s++)
-            for (int64_t c = 0; c < channels; c++) block[s * channels + c] = load(first[s * at.site + c]);
+            for (int64_t c = 0; c < channels; c++) block[s * channels + c] = to_float(first[s * at.site + c]);
     else
         for (int64_t c = 0; c < channels; c++)
-            for (int64_t s = 0; s < sites; s++) block[s * channels + c] = load(first[s * at.site + c * at.channel]);
+            for (int64_t s = 0; s < sites; s++) block[s * channels + c] = to_float(first[s * at.site + c * at.channel]);
 }
 
-// A block of the incoming gradient: (sites, channels) with a step from site to site, in place where that is possible.
+// A block of the incoming gradient: (sites, channels), `step` floats from site to site; not copied where possible.
 struct Block { const float *first; int64_t step; };
 
-inline Block take(const Call &call, const Tile &tile, int64_t channel, int64_t channels, float *room) {
+inline Block load_gradient(const Call &call, const Tile &tile, int64_t channel, int64_t channels, float *buffer) {
     Layout at = layout(call.gradient_stride, tile);
     at.base += channel * at.channel;
     if (call.gradient_type == FLOAT32) {
         const float *values = static_cast<const float *>(call.gradient);
         if (at.channel == 1) return {values + at.base, at.site};
-        if (at.site == 1) transpose(values + at.base, at.channel, room, channels, channels, tile.number);
-        else load_block(values, at, tile.number, channels, room);
+        if (at.site == 1) transpose(values + at.base, at.channel, buffer, channels, channels, tile.count);
+        else load_block(values, at, tile.count, channels, buffer);
     } else if (call.gradient_type == BFLOAT16) {
-        load_block(static_cast<const Bfloat16 *>(call.gradient), at, tile.number, channels, room);
+        load_block(static_cast<const Bfloat16 *>(call.gradient), at, tile.count, channels, buffer);
     } else {
-        load_block(static_cast<const Float16 *>(call.gradient), at, tile.number, channels, room);
+        load_block(static_cast<const Float16 *>(call.gradient), at, tile.count, channels, buffer);
     }
-    return {room, channels};
+    return {buffer, channels};
 }
 
-inline void show(const Call &call, const Tile &tile) {
-    const int64_t *n = call.sites;
-    const int64_t at = (((tile.scene * call.views + tile.view) * n[2] + tile.k) * n[1] + tile.j) * n[0] + tile.i;
-    uint8_t *visible = call.visible + at;
-    const int number = int(tile.number);
+inline void store_visible(const Call &call, const Tile &tile) {
+    const int64_t *size = call.sites;
+    const int64_t row = ((tile.scene * call.views + tile.view) * size[2] + tile.k) * size[1] + tile.j;
+    uint8_t *visible = call.visible + row * size[0] + tile.i;
+    const int n = int(tile.count);
     if (tile.along_z)
-        for (int s = 0; s < number; s++) visible[s * n[0] * n[1]] = uint8_t(tile.visible[s]);
+        for (int s = 0; s < n; s++) visible[s * size[0] * size[1]] = uint8_t(tile.visible[s]);
     else
-        for (int s = 0; s < number; s++) visible[s] = uint8_t(tile.visible[s]);
+        for (int s = 0; s < n; s++) visible[s] = uint8_t(tile.visible[s]);
 }
 
-// The channels that geometry gives: depth, direction, extras; `step` floats from one to the next.
-inline void append(const Call &call, const Tile &tile, int s, float *out) {
+// The geometric channels: depth, direction, extras.
+inline void append_extra(const Call &call, const Tile &tile, int s, float *out) {
     if (call.depth) *out++ = tile.distance[s];
     if (call.direction)
         for (int row = 0; row < 3; row++) *out++ = tile.direction[row][s];
@@ -90,14 +90,14 @@ inline const View &view_of(const Plan &plan, const Tile &tile) {
     return plan.views[tile.scene * plan.call->views + tile.view];
 }
 
-inline void start(const Plan &plan, Tile &tile, int64_t scene, int64_t view, int64_t number) {
+inline void start_tile(const Plan &plan, Tile &tile, int64_t scene, int64_t view, int64_t number) {
     const Call &call = *plan.call;
     const int64_t row = number / plan.tiles_per_row, part = number % plan.tiles_per_row;
     const int64_t length = plan.along_z ? call.sites[2] : call.sites[0];
     const int64_t first = part * length / plan.tiles_per_row, last = (part + 1) * length / plan.tiles_per_row;
     tile.scene = scene;
     tile.view = view;
-    tile.number = last - first;
+    tile.count = last - first;
     tile.along_z = plan.along_z;
     tile.k = plan.along_z ? first : row / call.sites[1];
     tile.j = plan.along_z ? row / call.sites[0] : row % call.sites[1];
@@ -105,11 +105,11 @@ inline void start(const Plan &plan, Tile &tile, int64_t scene, int64_t view, int
 }
 
 template <class S>
-inline const S *source_of(const Call &call, int64_t scene, int64_t view) {
+inline const S *source_pointer(const Call &call, int64_t scene, int64_t view) {
     return static_cast<const S *>(call.source) + scene * call.source_stride[0] + view * call.source_stride[1];
 }
 
-inline float *gradient_of(const Call &call, int64_t scene, int64_t view) {
+inline float *gradient_pointer(const Call &call, int64_t scene, int64_t view) {
     return call.source_gradient + scene * call.source_gradient_stride[0] + view * call.source_gradient_stride[1];
 }
 
@@ -119,13 +119,13 @@ inline void axis_strides(const int64_t *stride, int64_t *axes) {  // to the orde
     axes[2] = stride[2];
 }
 
-// Whether no site of a tile in a volume's lattice reads anything, seen from its two ends: indices change along a tile
-// in one direction. Much of a sweep lies beside the volume. Nothing is lost by a "no"; the margin is beyond rounding.
-inline bool is_beside(const Call &call, const View &view, const Tile &tile) {
-    if (call.kind != VOLUMES) return false;
+// Whether a tile of a sweep reads nothing, judged by its two ends: indices are monotonic along a tile. Much of a sweep
+// lies outside the volume. A wrong "no" costs only time; the margin exceeds rounding errors.
+inline bool misses_volume(const Call &call, const View &view, const Tile &tile) {
+    if (call.kind != PLANE_SWEEP_PROJECT) return false;
     if (view.masked) return true;
     if (call.border) return false;
-    const int64_t last = tile.number - 1;
+    const int64_t last = tile.count - 1;
     double index[3][2];
     for (int end = 0; end < 2; end++) {
         const double x = call.x[tile.i + (tile.along_z ? 0 : end * last)], y = call.y[tile.j];
@@ -143,82 +143,83 @@ inline bool is_beside(const Call &call, const View &view, const Tile &tile) {
     return false;
 }
 
-// Zeros for a whole tile that nobody sees.
-inline void blank(const Call &call, Tile &tile, const Layout &at) {
-    for (int64_t s = 0; s < tile.number; s++) tile.visible[s] = 0;
-    show(call, tile);
+// Zeros for a tile that reads nothing.
+inline void store_zeros(const Call &call, Tile &tile, const Layout &at) {
+    for (int64_t s = 0; s < tile.count; s++) tile.visible[s] = 0;
+    store_visible(call, tile);
     float *out = static_cast<float *>(call.values) + at.base;
     if (at.channel == 1 && at.site == call.channels) {
-        std::memset(out, 0, size_t(tile.number * call.channels) * sizeof(float));
+        std::memset(out, 0, size_t(tile.count * call.channels) * sizeof(float));
     } else if (at.site == 1) {
         for (int64_t c = 0; c < call.channels; c++)
-            std::memset(out + c * at.channel, 0, size_t(tile.number) * sizeof(float));
+            std::memset(out + c * at.channel, 0, size_t(tile.count) * sizeof(float));
     } else {
-        for (int64_t s = 0; s < tile.number; s++)
+        for (int64_t s = 0; s < tile.count; s++)
             for (int64_t c = 0; c < call.channels; c++) out[s * at.site + c * at.channel] = 0.0f;
     }
 }
 
-// Forward, every view by itself: tiles first to last of one view.
+// Forward without statistics: tiles first to last of one view.
 template <int DIMS, class S>
-void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_t last, Room &room) {
+void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_t last, Workspace &workspace) {
     const Call &call = *plan.call;
-    Tile &tile = *static_cast<Tile *>(room.tiles);
+    Tile &tile = *static_cast<Tile *>(workspace.tiles);
     int64_t axes[3];
     axis_strides(call.source_stride, axes);
-    const S *source = source_of<S>(call, scene, view);
+    const S *source = source_pointer<S>(call, scene, view);
     const int64_t channels = plan.channels;
-    const Plain image = plain(call, axes);
-    // One of an image: without any, the only one may be geometry.
+    const OneChannelImage image = one_channel_image(call, axes);
+    // Of an image: without any, the only one may be geometric.
     const bool one_channel = DIMS == 2 && call.channels == 1 && channels == 1 && image.fits;
     for (int64_t number = first; number < last; number++) {
-        start(plan, tile, scene, view, number);
+        start_tile(plan, tile, scene, view, number);
         const Layout at = layout(call.values_stride, tile);
-        if (channels == call.channels && call.values_type == FLOAT32 && is_beside(call, view_of(plan, tile), tile)) {
-            blank(call, tile, at);
+        const bool can_skip = channels == call.channels && call.values_type == FLOAT32;
+        if (can_skip && misses_volume(call, view_of(plan, tile), tile)) {
+            store_zeros(call, tile, at);
             continue;
         }
         locate<DIMS>(call, view_of(plan, tile), tile);
-        show(call, tile);
-        const bool direct = call.values_type == FLOAT32 && at.channel == 1;
-        float *out = direct ? static_cast<float *>(call.values) + at.base : room.values;
-        const int64_t step = direct ? at.site : channels;
-        if (one_channel && step == 1 && gather_row(call, tile, source, image, out)) {
-            if (!direct) put(call, at, tile.number, channels, room.values);
+        store_visible(call, tile);
+        const bool in_place = call.values_type == FLOAT32 && at.channel == 1;
+        float *out = in_place ? static_cast<float *>(call.values) + at.base : workspace.values;
+        const int64_t step = in_place ? at.site : channels;
+        if (one_channel && step == 1 && gather_one_channel(call, tile, source, image, out)) {
+            if (!in_place) store_tile(call, at, tile.count, channels, workspace.values);
             continue;
         }
-        for (int s = 0; s < int(tile.number); s++) {
+        for (int s = 0; s < int(tile.count); s++) {
             gather<DIMS>(call, tile, s, source, axes, call.channels, out + s * step);
-            append(call, tile, s, out + s * step + call.channels);
+            append_extra(call, tile, s, out + s * step + call.channels);
         }
-        if (!direct) put(call, at, tile.number, channels, room.values);
+        if (!in_place) store_tile(call, at, tile.count, channels, workspace.values);
     }
 }
 
 // Statistics of one site
 
-// The values of the views that see site s, one after another in room.values; returns how many, and who they are.
+// The values of the views that see site s, one after another in workspace.values; returns their number.
 template <class S>
-inline int64_t visible_values(const Plan &plan, const Tile *tiles, int s, int64_t channel, int64_t channels,
-                              bool geometry, Room &room) {
+inline int64_t gather_visible(const Plan &plan, const Tile *tiles, int s, int64_t channel, int64_t channels,
+                              bool geometry, Workspace &workspace) {
     const Call &call = *plan.call;
     const int64_t step = channels + (geometry ? plan.channels - call.channels : 0);
     int64_t axes[3], count = 0;
     axis_strides(call.source_stride, axes);
     for (int64_t v = 0; v < call.views; v++) {
         if (!tiles[v].visible[s]) continue;
-        float *out = room.values + count * step;
-        const S *source = source_of<S>(call, tiles[v].scene, v) + channel;
+        float *out = workspace.values + count * step;
+        const S *source = source_pointer<S>(call, tiles[v].scene, v) + channel;
         gather<2>(call, tiles[v], s, source, axes, channels, out);
-        if (geometry) append(call, tiles[v], s, out + channels);
-        room.seen[count++] = v;
+        if (geometry) append_extra(call, tiles[v], s, out + channels);
+        workspace.visible_views[count++] = v;
     }
     return count;
 }
 
 constexpr float LARGEST_ROOT = 0x1.fffffep63f;  // the square root of the largest float
 
-template <int W> INLINE Floats<W> held_lanes(Floats<W> values, float largest) {
+template <int W> INLINE Floats<W> clamped_lanes(Floats<W> values, float largest) {
     const Floats<W> below = values > largest ? Floats<W>{} + largest : values;
     return below < -largest ? Floats<W>{} - largest : below;
 }
@@ -226,7 +227,7 @@ template <int W> INLINE Floats<W> held_lanes(Floats<W> values, float largest) {
 template <int W> INLINE Floats<W> mean_of(const float *values, int64_t count, int64_t step) {
     const float share = 1.0f / float(count);
     Floats<W> mean = {};
-    for (int64_t v = 0; v < count; v++) mean += read<W>(values + v * step) * share;
+    for (int64_t v = 0; v < count; v++) mean += load<W>(values + v * step) * share;
     return mean;
 }
 
@@ -234,33 +235,33 @@ template <int W> INLINE Floats<W> variance_of(const float *values, int64_t count
     const float share = 1.0f / float(count);
     Floats<W> result = {};
     for (int64_t v = 0; v < count; v++) {
-        const Floats<W> apart = held_lanes<W>(read<W>(values + v * step) - mean, LARGEST_ROOT);
-        result += apart * apart * share;
+        const Floats<W> deviation = clamped_lanes<W>(load<W>(values + v * step) - mean, LARGEST_ROOT);
+        result += deviation * deviation * share;
     }
-    return held_lanes<W>(result, LARGEST);
+    return clamped_lanes<W>(result, LARGEST);
 }
 
-template <int W> INLINE bool is_any(Masks<W> lanes) {
+template <int W> INLINE bool any_lane(Masks<W> lanes) {
     int32_t any = 0;
     for (int lane = 0; lane < W; lane++) any |= lanes[lane];
     return any != 0;
 }
 
-// The first of the views that has the largest value, a NaN above all, and that value.
-template <int W> INLINE Masks<W> best_of(const float *values, int64_t count, int64_t step, Floats<W> &best) {
-    best = read<W>(values);
+// The first view with the largest value, where a NaN is above all, and that value.
+template <int W> INLINE Masks<W> max_of(const float *values, int64_t count, int64_t step, Floats<W> &best) {
+    best = load<W>(values);
     Masks<W> first = {};
     for (int64_t v = 1; v < count; v++) {
-        const Floats<W> value = read<W>(values + v * step);
-        const Masks<W> stays = (value <= best) | (best != best);
-        best = stays ? best : value;
-        first = stays ? first : Masks<W>{} + int32_t(v);
+        const Floats<W> value = load<W>(values + v * step);
+        const Masks<W> keeps = (value <= best) | (best != best);
+        best = keeps ? best : value;
+        first = keeps ? first : Masks<W>{} + int32_t(v);
     }
     return first;
 }
 
-// Statistics of `count` rows of values, one block of channels after another.
-inline void summarise(const Call &call, const float *values, int64_t count, int64_t channels, float *out) {
+// Statistics of `count` rows of values, a block of channels for each.
+inline void statistics(const Call &call, const float *values, int64_t count, int64_t channels, float *out) {
     if (count == 0) {
         std::memset(out, 0, size_t(call.statistics * channels) * sizeof(float));
         return;
@@ -271,51 +272,52 @@ inline void summarise(const Call &call, const float *values, int64_t count, int6
         for (int64_t block = 0; block < call.statistics; block++) {
             Floats<W> result = {};
             if (call.statistic[block] == MAX) {
-                best_of<W>(first, count, channels, result);
+                max_of<W>(first, count, channels, result);
             } else {
                 result = mean_of<W>(first, count, channels);
                 if (call.statistic[block] == VARIANCE) result = variance_of<W>(first, count, channels, result);
             }
-            write<W>(out + block * channels + c, result);
+            store<W>(out + block * channels + c, result);
         }
     });
 }
 
-// Forward with the views reduced: tiles first to last of one scene.
+// Forward with statistics over the views: tiles first to last of one scene.
 template <class S>
-void reduce(const Plan &plan, int64_t scene, int64_t first, int64_t last, Room &room) {
+void reduce(const Plan &plan, int64_t scene, int64_t first, int64_t last, Workspace &workspace) {
     const Call &call = *plan.call;
-    Tile *tiles = static_cast<Tile *>(room.tiles);
+    Tile *tiles = static_cast<Tile *>(workspace.tiles);
     const int64_t channels = plan.channels, total = call.statistics * channels;
     const bool only_mean = call.statistics == 1 && call.statistic[0] == MEAN && channels == call.channels;
     int64_t axes[3];
     axis_strides(call.source_stride, axes);
     for (int64_t number = first; number < last; number++) {
         for (int64_t v = 0; v < call.views; v++) {
-            start(plan, tiles[v], scene, v, number);
+            start_tile(plan, tiles[v], scene, v, number);
             locate<2>(call, view_of(plan, tiles[v]), tiles[v]);
-            show(call, tiles[v]);
+            store_visible(call, tiles[v]);
         }
         const Layout at = layout(call.values_stride, tiles[0]);
-        const bool direct = call.values_type == FLOAT32 && at.channel == 1;
-        for (int s = 0; s < int(tiles[0].number); s++) {
-            float *out = direct ? static_cast<float *>(call.values) + at.base + s * at.site : room.reduced + s * total;
+        const bool in_place = call.values_type == FLOAT32 && at.channel == 1;
+        for (int s = 0; s < int(tiles[0].count); s++) {
+            float *out = in_place ? static_cast<float *>(call.values) + at.base + s * at.site
+                                  : workspace.reduced + s * total;
             if (only_mean) {
                 int64_t count = 0;
                 for (int64_t v = 0; v < call.views; v++) count += tiles[v].visible[s];
                 bool add = false;
                 for (int64_t v = 0; v < call.views; v++) {
                     if (!tiles[v].visible[s]) continue;
-                    const S *source = source_of<S>(call, scene, v);
+                    const S *source = source_pointer<S>(call, scene, v);
                     gather<2>(call, tiles[v], s, source, axes, channels, out, 1.0f / float(count), add);
                     add = true;
                 }
                 if (!add) std::memset(out, 0, size_t(channels) * sizeof(float));
                 continue;
             }
-            const int64_t count = visible_values<S>(plan, tiles, s, 0, call.channels, true, room);
-            summarise(call, room.values, count, channels, out);
+            const int64_t count = gather_visible<S>(plan, tiles, s, 0, call.channels, true, workspace);
+            statistics(call, workspace.values, count, channels, out);
         }
-        if (!direct) put(call, at, tiles[0].number, total, room.reduced);
+        if (!in_place) store_tile(call, at, tiles[0].count, total, workspace.reduced);
     }
 }

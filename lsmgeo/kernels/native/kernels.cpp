@@ -1,7 +1,7 @@
-// Fused resampling on the CPU: a C library without Python or PyTorch, bound by lsmgeo/kernels/cpu.py.
+// Fused resampling on the CPU: a C library without Python or PyTorch; lsmgeo/kernels/native/library.py calls it.
 //
-// resample.h is compiled for several instruction sets; the best that the machine has is taken when the library loads.
-// Work is split in tasks that write to places of their own, so that results depend neither on which thread runs which
+// resample.h is compiled for several instruction sets; loading the library selects the best that the machine has.
+// Work is split into tasks that write to separate memory, so that results depend neither on which thread runs which
 // task nor on their order.
 
 #include <algorithm>
@@ -33,16 +33,16 @@
 #define EXPORT extern "C" __attribute__((visibility("default")))
 #endif
 
-// What is written with vectors has to be inlined, lest vectors be handed from function to function.
+// Functions on vectors are inlined: vectors must not be passed between functions.
 #define INLINE inline __attribute__((always_inline))
 #define INLINED __attribute__((always_inline))
 
 namespace {
 
-// A camera, or what a volume is to a camera, in the scale in which the kernels compute.
+// The matrices of a view, in the scale in which the kernels compute.
 struct View {
-    double matrix[3][4], scale;              // M by a power of two that keeps M q from overflow
-    double direction[3][4], direction_scale; // G by a power of two that brings it near 1
+    double matrix[3][4], scale;              // M times a power of two that keeps M q from overflow
+    double direction[3][4], direction_scale; // G times a power of two that brings it near 1
     double terms, terms_z;                   // bound on the terms of G q: terms + terms_z |z|
     bool masked;
 };
@@ -50,18 +50,18 @@ struct View {
 struct Plan {
     const Call *call;
     const View *views;       // (B, V)
-    int64_t channels;        // of a view's values, those of geometry among them
+    int64_t channels;        // of a view's values, with the geometric ones
     int64_t tiles, tiles_per_row, blocks;
     bool along_z, backward;
 };
 
-struct Needs { int64_t tile, geometric, length; };
+struct TileSizes { int64_t tile, site_gradients, length; };  // bytes, bytes, sites
 
-// Memory for one thread.
-struct Room {
-    void *tiles, *geometric;
-    float *values, *reduced, *spread, *nothing;
-    int64_t *seen;
+// The memory of one thread.
+struct Workspace {
+    void *tiles, *site_gradients;
+    float *values, *reduced, *value_gradients, *zeros;
+    int64_t *visible_views;
 };
 
 #define LANES 4
@@ -69,7 +69,7 @@ namespace baseline {
 #include "resample.h"
 }
 
-// LSMGEO_ONE_SET builds the first alone, in a fraction of the time.
+// LSMGEO_ONE_SET builds only the first, in a fraction of the time.
 #if VARIANTS
 #pragma GCC push_options
 #pragma GCC target("avx2,fma,bmi2")
@@ -89,8 +89,8 @@ namespace avx512 {
 #pragma GCC pop_options
 #endif
 
-using Runner = void (*)(const Plan &, int64_t, Room &);
-struct InstructionSet { const char *name; Runner run; Needs needs; };
+using Runner = void (*)(const Plan &, int64_t, Workspace &);
+struct InstructionSet { const char *name; Runner run; TileSizes sizes; };
 
 // The sets that this machine can run, best first.
 std::vector<InstructionSet> available() {
@@ -101,21 +101,21 @@ std::vector<InstructionSet> available() {
                           __builtin_cpu_supports("bmi2");
     if (has_avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
         __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-        sets.push_back({"avx512", avx512::run_task, avx512::needs()});
-    if (has_avx2) sets.push_back({"avx2", avx2::run_task, avx2::needs()});
+        sets.push_back({"avx512", avx512::run_task, avx512::tile_sizes()});
+    if (has_avx2) sets.push_back({"avx2", avx2::run_task, avx2::tile_sizes()});
 #endif
-    sets.push_back({"baseline", baseline::run_task, baseline::needs()});
+    sets.push_back({"baseline", baseline::run_task, baseline::tile_sizes()});
     return sets;
 }
 
 InstructionSet chosen = available().front();
 
-// Threads: those of an OpenMP runtime that PyTorch has loaded already, so that two pools do not fight for the cores.
+// Threads of the OpenMP runtime that PyTorch has loaded already, so that two pools do not compete for the cores.
 using OpenMp = void (*)(void (*)(void *), void *, unsigned, unsigned);
 OpenMp openmp = nullptr;
 
 template <class Body>
-void on_threads(int64_t threads, Body &body) {
+void run_on_threads(int64_t threads, Body &body) {
     auto call = [](void *argument) { (*static_cast<Body *>(argument))(); };
     if (threads <= 1) return call(&body);
     if (openmp) return openmp(call, &body, unsigned(threads), 0);
@@ -134,24 +134,24 @@ void on_threads(int64_t threads, Body &body) {
 
 double power_of_two_above(double value) { return std::exp2(std::ceil(std::log2(value))); }
 
-double largest_of(const double *values, int64_t count, int64_t stride = 1) {
+double max_abs(const double *values, int64_t count, int64_t stride = 1) {
     double largest = 0.0;
     for (int64_t number = 0; number < count; number++) largest = std::max(largest, std::fabs(values[number * stride]));
     return largest;
 }
 
-void prepare(const Call &call, int64_t scene, int64_t number, double reach_x, double reach_y, View &view) {
+void prepare_view(const Call &call, int64_t scene, int64_t number, double reach_x, double reach_y, View &view) {
     const int64_t at = scene * call.views + number;
     view.masked = call.view_mask && !call.view_mask[at];
-    const double reach_z =
-        largest_of(call.z + scene * call.z_stride[0] + number * call.z_stride[1], call.sites[2], call.z_stride[2]);
+    const double *z = call.z + scene * call.z_stride[0] + number * call.z_stride[1];
+    const double reach_z = max_abs(z, call.sites[2], call.z_stride[2]);
     auto bound = [](const double *matrix, double *columns) {
-        for (int column = 0; column < 4; column++) columns[column] = largest_of(matrix + column, 3, 4);
+        for (int column = 0; column < 4; column++) columns[column] = max_abs(matrix + column, 3, 4);
     };
     double columns[4];
     const double *matrix = call.matrix + 12 * at;
     view.scale = 1.0;
-    if (call.kind == IMAGES) {
+    if (call.kind == UNPROJECT) {
         bound(matrix, columns);
         const double extent = columns[0] * reach_x + columns[1] * reach_y + columns[2] * reach_z + columns[3];
         if (extent > 0x1p100) view.scale = 1.0 / power_of_two_above(extent * 0x1p-100);
@@ -159,7 +159,7 @@ void prepare(const Call &call, int64_t scene, int64_t number, double reach_x, do
     for (int entry = 0; entry < 12; entry++) view.matrix[entry / 4][entry % 4] = matrix[entry] * view.scale;
     if (!call.direction) return;
     const double *direction = call.direction_matrix + 12 * at;
-    const double largest = largest_of(direction, 12);
+    const double largest = max_abs(direction, 12);
     view.direction_scale = largest > 0.0 ? 1.0 / power_of_two_above(largest) : 1.0;
     for (int entry = 0; entry < 12; entry++)
         view.direction[entry / 4][entry % 4] = direction[entry] * view.direction_scale;
@@ -174,37 +174,38 @@ int run(const Call &call, bool backward) {
     plan.call = &call;
     plan.backward = backward;
     plan.channels = call.channels + call.depth + 3 * call.direction + call.extra;
-    // Tiles follow z where neighbours in z are neighbours in memory.
+    // Tiles run along z where neighbours in z are adjacent in memory.
     const int64_t *stride = backward ? call.gradient_stride : call.values_stride;
-    plan.along_z = call.kind == VOLUMES && call.sites[2] > 1 && stride[3] != 0 && stride[3] < stride[5];
+    plan.along_z = call.kind == PLANE_SWEEP_PROJECT && call.sites[2] > 1 && stride[3] != 0 && stride[3] < stride[5];
     const int64_t length = plan.along_z ? call.sites[2] : call.sites[0];
     const int64_t sites = call.sites[0] * call.sites[1] * call.sites[2];
     if (sites == 0 || call.scenes == 0 || call.views == 0) return 0;
-    plan.tiles_per_row = (length + chosen.needs.length - 1) / chosen.needs.length;
+    plan.tiles_per_row = (length + chosen.sizes.length - 1) / chosen.sizes.length;
     plan.tiles = sites / length * plan.tiles_per_row;
-    // A few thousand sites a task, fewer where each costs more.
+    // A few thousand sites for each task, fewer where each costs more.
     const int64_t work = 1 + sites * (plan.channels + 16) * (call.statistics ? call.views : 1) / 131072;
     plan.blocks = std::min(plan.tiles, work);
-    const int64_t parts = call.scenes * (call.statistics || (backward && call.kind == VOLUMES) ? 1 : call.views);
+    const bool whole_scenes = call.statistics || (backward && call.kind == PLANE_SWEEP_PROJECT);
+    const int64_t parts = call.scenes * (whole_scenes ? 1 : call.views);
     const int64_t tasks = parts * (backward ? call.chunks : plan.blocks);
 
     std::unique_ptr<View[]> views(new (std::nothrow) View[size_t(call.scenes * call.views)]());
     if (!views) return 1;
     plan.views = views.get();
-    if (call.kind != PIXELS) {
-        const double reach_x = largest_of(call.x, call.sites[0]), reach_y = largest_of(call.y, call.sites[1]);
+    if (call.kind != SAMPLE_VIEWS) {
+        const double reach_x = max_abs(call.x, call.sites[0]), reach_y = max_abs(call.y, call.sites[1]);
         for (int64_t scene = 0; scene < call.scenes; scene++)
             for (int64_t view = 0; view < call.views; view++)
-                prepare(call, scene, view, reach_x, reach_y, views[size_t(scene * call.views + view)]);
+                prepare_view(call, scene, view, reach_x, reach_y, views[size_t(scene * call.views + view)]);
     }
 
     const int64_t tiles = call.statistics ? call.views : 1;
     const int64_t statistics = std::max<int64_t>(call.statistics, 1);
-    const int64_t of_values = std::max(chosen.needs.length, call.statistics ? call.views : 0) * plan.channels;
-    const int64_t floats = 2 * of_values + statistics * chosen.needs.length * plan.channels + plan.channels;
-    const int64_t bytes = tiles * (chosen.needs.tile + chosen.needs.geometric) + 4 * floats + 8 * call.views + 256;
-    // Each thread starts in a part of its own and then helps the others: two threads side by side would fault in, and
-    // clear, the same fresh pages.
+    const int64_t value_floats = std::max(chosen.sizes.length, call.statistics ? call.views : 0) * plan.channels;
+    const int64_t floats = 2 * value_floats + statistics * chosen.sizes.length * plan.channels + plan.channels;
+    const int64_t bytes = tiles * (chosen.sizes.tile + chosen.sizes.site_gradients) + 4 * floats + 8 * call.views + 256;
+    // Each thread starts with its own part and then helps the others: two threads next to each other would fault in,
+    // and clear, the same fresh pages.
     const int64_t threads = std::max<int64_t>(1, std::min(call.threads, tasks));
     std::unique_ptr<std::atomic<int64_t>[]> next(new (std::nothrow) std::atomic<int64_t>[size_t(threads)]);
     if (!next) return 1;
@@ -213,7 +214,7 @@ int run(const Call &call, bool backward) {
     auto body = [&]() {
         std::unique_ptr<char[]> memory(new (std::nothrow) char[size_t(bytes)]);
         if (!memory) return;
-        Room room;
+        Workspace workspace;
         char *place = memory.get();
         auto reserve = [&](int64_t size) {
             place = reinterpret_cast<char *>((reinterpret_cast<uintptr_t>(place) + 15) & ~uintptr_t(15));
@@ -221,23 +222,23 @@ int run(const Call &call, bool backward) {
             place += size;
             return reserved;
         };
-        room.seen = reinterpret_cast<int64_t *>(reserve(8 * call.views));
-        room.tiles = reserve(tiles * chosen.needs.tile);
-        room.geometric = reserve(tiles * chosen.needs.geometric);
-        room.values = reinterpret_cast<float *>(reserve(4 * of_values));
-        room.spread = reinterpret_cast<float *>(reserve(4 * of_values));
-        room.reduced = reinterpret_cast<float *>(reserve(4 * statistics * chosen.needs.length * plan.channels));
-        room.nothing = reinterpret_cast<float *>(reserve(4 * plan.channels));
-        std::fill(room.nothing, room.nothing + plan.channels, 0.0f);
+        workspace.visible_views = reinterpret_cast<int64_t *>(reserve(8 * call.views));
+        workspace.tiles = reserve(tiles * chosen.sizes.tile);
+        workspace.site_gradients = reserve(tiles * chosen.sizes.site_gradients);
+        workspace.values = reinterpret_cast<float *>(reserve(4 * value_floats));
+        workspace.value_gradients = reinterpret_cast<float *>(reserve(4 * value_floats));
+        workspace.reduced = reinterpret_cast<float *>(reserve(4 * statistics * chosen.sizes.length * plan.channels));
+        workspace.zeros = reinterpret_cast<float *>(reserve(4 * plan.channels));
+        std::fill(workspace.zeros, workspace.zeros + plan.channels, 0.0f);
         const int64_t own = arrived++;
-        for (int64_t turn = 0; turn < threads; turn++) {
-            const int64_t part = (own + turn) % threads, last = (part + 1) * tasks / threads;
-            std::atomic<int64_t> &place = next[size_t(part)];
-            for (int64_t task = place++; task < last; task = place++) chosen.run(plan, task, room);
+        for (int64_t offset = 0; offset < threads; offset++) {
+            const int64_t part = (own + offset) % threads, last = (part + 1) * tasks / threads;
+            std::atomic<int64_t> &counter = next[size_t(part)];
+            for (int64_t task = counter++; task < last; task = counter++) chosen.run(plan, task, workspace);
         }
     };
-    on_threads(threads, body);
-    return arrived.load() == 0 ? 1 : 0;  // one thread with memory does the work of all
+    run_on_threads(threads, body);
+    return arrived.load() == 0 ? 1 : 0;  // one thread with memory does all the work
 }
 
 }  // namespace
@@ -248,10 +249,10 @@ EXPORT int lsmgeo_backward(const Call *call) { return run(*call, true); }
 
 EXPORT int64_t lsmgeo_size_of_call() { return int64_t(sizeof(Call)); }
 
-// Use this OpenMP runtime's threads: the address of its GOMP_parallel, or null for threads of our own.
+// Use the threads of an OpenMP runtime: the address of its GOMP_parallel, or null to start threads here.
 EXPORT void lsmgeo_use_openmp(void *parallel) { openmp = reinterpret_cast<OpenMp>(parallel); }
 
-// The instruction set in use; another can be asked for by name. Null if the machine does not have it.
+// The instruction set in use, after selecting one by name if given; null if the machine does not have it.
 EXPORT const char *lsmgeo_instruction_set(const char *name) {
     if (name)
         for (const auto &set : available())

@@ -32,7 +32,7 @@ __all__ = [
     "why_not",
 ]
 
-IMAGES, PIXELS, VOLUMES = range(3)
+UNPROJECT, SAMPLE_VIEWS, PLANE_SWEEP_PROJECT = range(3)
 TYPES = {torch.float32: 0, torch.bfloat16: 1, torch.float16: 2}
 STATISTICS = {"mean": 0, "variance": 1, "max": 2}
 HUGE = 4 << 20  # bytes from which an output is put in huge pages
@@ -164,11 +164,11 @@ def _channels_last(source: Tensor, axis: int) -> Tensor:
     return source.movedim(axis, -1).contiguous().movedim(-1, axis)
 
 
-def _start(kind: int, source: Tensor, options: Options, sites: Sequence[int]) -> _Call:
+def _new_call(kind: int, source: Tensor, options: Options, sites: Sequence[int]) -> _Call:
     call = _Call()
     call.kind, call.threads = kind, torch.get_num_threads()
     strides = source.stride()
-    if kind == VOLUMES:
+    if kind == PLANE_SWEEP_PROJECT:
         call.scenes, call.channels, *sizes = source.shape
         call.source_stride[:] = (strides[0], 0, *strides[2:])
     else:
@@ -186,7 +186,7 @@ def _start(kind: int, source: Tensor, options: Options, sites: Sequence[int]) ->
     return call
 
 
-def _place(call: _Call, sites: Sites, options: Options) -> tuple[Tensor | None, ...]:
+def _set_sites(call: _Call, sites: Sites, options: Options) -> tuple[Tensor | None, ...]:
     """Hand over the geometry; the answer must live as long as the call."""
     B, V = call.scenes, call.views = sites.matrix.shape[:2]
     matrix, x, y = sites.matrix.contiguous(), sites.x.contiguous(), sites.y.contiguous()
@@ -202,18 +202,18 @@ def _place(call: _Call, sites: Sites, options: Options) -> tuple[Tensor | None, 
     return matrix, direction, x, y, z, mask
 
 
-def _gradient(call: _Call, gradient: Tensor, options: Options) -> None:
+def _set_gradient(call: _Call, gradient: Tensor, options: Options) -> None:
     """Hand over the incoming gradient; split the channels where scenes and views alone would not feed the threads."""
     call.gradient, call.gradient_type = gradient.data_ptr(), TYPES[gradient.dtype]
-    call.gradient_stride[:] = _six(gradient, options)
-    units = max(1, call.scenes * (1 if call.kind == VOLUMES or call.statistics else call.views))
+    call.gradient_stride[:] = _value_strides(gradient, options)
+    units = max(1, call.scenes * (1 if call.kind == PLANE_SWEEP_PROJECT or call.statistics else call.views))
     chunks = min(call.channels // (2 * LEAST_CHUNK), -(-2 * call.threads // units))
     if chunks * units < call.threads:
         chunks = min(call.channels // LEAST_CHUNK, -(-call.threads // units))
     call.chunks = max(1, chunks)
 
 
-def _source_gradient(call: _Call, source: Tensor, axis: int, into: Tensor | None) -> Tensor:
+def _set_source_gradient(call: _Call, source: Tensor, axis: int, into: Tensor | None) -> Tensor:
     """Where the source's gradient goes, in float32: `into`, to be added to, or fresh memory that the kernel clears."""
     if into is None:
         order = [other for other in range(source.dim()) if other != axis]
@@ -230,7 +230,7 @@ def _source_gradient(call: _Call, source: Tensor, axis: int, into: Tensor | None
     return gradient
 
 
-def _geometry_gradients(call: _Call, needs: Sequence[bool]) -> list[Tensor | None]:
+def _set_geometry_gradients(call: _Call, needs: Sequence[bool]) -> list[Tensor | None]:
     """Room for the gradients to matrix, direction and z, a part for each chunk of channels."""
     B, V, D = call.scenes, call.views, call.sites[2]
     shapes = ((3, 4), (3, 4), (D,))
@@ -244,19 +244,19 @@ def _geometry_gradients(call: _Call, needs: Sequence[bool]) -> list[Tensor | Non
     return parts
 
 
-def _together(parts: Sequence[Tensor | None]) -> list[Tensor | None]:
+def _over_chunks(parts: Sequence[Tensor | None]) -> list[Tensor | None]:
     return [None if part is None else part.sum(2) for part in parts]
 
 
-def _lattice(kind: int, source: Tensor, sites: Sites, options: Options) -> tuple[_Call, tuple[Tensor | None, ...]]:
+def _lattice_call(kind: int, source: Tensor, sites: Sites, options: Options) -> tuple[_Call, tuple[Tensor | None, ...]]:
     """A call on the sites of a lattice, and what must live as long as it."""
     source = _channels_last(source, _channel_axis(kind))
-    call = _start(kind, source, options, (sites.x.shape[0], sites.y.shape[0], sites.z.shape[-1]))
-    return call, (source, *_place(call, sites, options))
+    call = _new_call(kind, source, options, (sites.x.shape[0], sites.y.shape[0], sites.z.shape[-1]))
+    return call, (source, *_set_sites(call, sites, options))
 
 
 def _channel_axis(kind: int) -> int:
-    return 1 if kind == VOLUMES else 2
+    return 1 if kind == PLANE_SWEEP_PROJECT else 2
 
 
 def _lattice_backward(
@@ -268,21 +268,21 @@ def _lattice_backward(
     needs: Sequence[bool],
     into: Tensor | None,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    call, kept = _lattice(kind, source, sites, options)
-    _gradient(call, gradient, options)
-    to_source = _source_gradient(call, source, _channel_axis(kind), into) if needs[0] else None
-    parts = _geometry_gradients(call, (needs[1], needs[2] and bool(options.direction), needs[3]))
+    call, alive = _lattice_call(kind, source, sites, options)
+    _set_gradient(call, gradient, options)
+    to_source = _set_source_gradient(call, source, _channel_axis(kind), into) if needs[0] else None
+    parts = _set_geometry_gradients(call, (needs[1], needs[2] and bool(options.direction), needs[3]))
     _run(call, backward=True)
-    del kept
+    del alive
     if to_source is not None and into is None:
         to_source = saturating_cast(to_source, source.dtype)
-    return to_source, *_together(parts)  # type: ignore[return-value]
+    return to_source, *_over_chunks(parts)  # type: ignore[return-value]
 
 
-def _sample(
-    call: _Call, kept: Sequence[Tensor | None], dtype: torch.dtype, options: Options, out: Tensor | None = None
+def _forward(
+    call: _Call, alive: Sequence[Tensor | None], dtype: torch.dtype, options: Options, out: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Run a call forward; `kept` must live as long as it. `out` is memory of the answer's shape to write to."""
+    """Run a call forward; `alive` must live as long as it. `out` is memory of the answer's shape to write to."""
     counts, reduced = call.sites[::-1], bool(options.reduce)
     channels = (call.channels + call.depth + 3 * call.direction + call.extra) * max(1, len(options.reduce))
     views = () if reduced else (call.views,)
@@ -291,13 +291,13 @@ def _sample(
         out = empty((call.scenes, *views, channels, *counts), dtype, order)
     visible = torch.empty((call.scenes, call.views, *counts), dtype=torch.bool, device="cpu")
     call.values, call.values_type, call.visible = out.data_ptr(), TYPES[out.dtype], visible.data_ptr()
-    call.values_stride[:] = _six(out, options)
+    call.values_stride[:] = _value_strides(out, options)
     _run(call, backward=False)
-    del kept
+    del alive
     return out, visible
 
 
-def _six(values: Tensor, options: Options) -> tuple[int, ...]:
+def _value_strides(values: Tensor, options: Options) -> tuple[int, ...]:
     """The strides of values (B, V, C', D, H, W), or of (B, C'', D, H, W) where views are reduced, with 0 for those."""
     strides = values.stride()
     return (strides[0], 0, *strides[1:]) if options.reduce else strides
@@ -305,7 +305,7 @@ def _six(values: Tensor, options: Options) -> tuple[int, ...]:
 
 def unproject(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """As `reference.unproject`; `out` is memory of the answer's shape to write to."""
-    return _sample(*_lattice(IMAGES, source, sites, options), source.dtype, options, out)
+    return _forward(*_lattice_call(UNPROJECT, source, sites, options), source.dtype, options, out)
 
 
 def unproject_backward(
@@ -330,7 +330,7 @@ def unproject_backward(
         Gradients, None where not asked for: of source in its dtype, of matrices (B, V, 3, 4) and of z (B, V, D) in
         float64.
     """
-    return _lattice_backward(IMAGES, gradient, source, sites, options, needs, into)
+    return _lattice_backward(UNPROJECT, gradient, source, sites, options, needs, into)
 
 
 def sample_views(
@@ -338,14 +338,14 @@ def sample_views(
 ) -> tuple[Tensor, Tensor]:
     """Sample images (B, V, C, h, w) at pixels (B, V, N, 2) where `front` (B, V, N), append `extra` (B, V, E, N)."""
     source = _channels_last(source, 2)
-    values, visible = _sample(*_pixel_call(source, pixels, front, extra, options), source.dtype, options)
+    values, visible = _forward(*_pixels_call(source, pixels, front, extra, options), source.dtype, options)
     return values[..., 0, 0, :], visible[:, :, 0, 0]
 
 
-def _pixel_call(
+def _pixels_call(
     source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options
 ) -> tuple[_Call, tuple[Tensor | None, ...]]:
-    call = _start(PIXELS, source, options, (front.shape[-1], 1, 1))
+    call = _new_call(SAMPLE_VIEWS, source, options, (front.shape[-1], 1, 1))
     pixels, front = pixels.float().contiguous(), front.contiguous()
     extras = None if extra is None else extra.float().movedim(2, 3).contiguous()
     call.pixels, call.front = pixels.data_ptr(), front.data_ptr()
@@ -365,9 +365,9 @@ def sample_views_backward(
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
     """Vector-Jacobian product of `sample_views` to source, pixels and extra, each in its dtype."""
     original, source = source, _channels_last(source, 2)
-    call, kept = _pixel_call(source, pixels, front, extra, options)
-    _gradient(call, gradient[..., None, None, :], options)
-    to_source = _source_gradient(call, source, 2, None) if needs[0] else None
+    call, alive = _pixels_call(source, pixels, front, extra, options)
+    _set_gradient(call, gradient[..., None, None, :], options)
+    to_source = _set_source_gradient(call, source, 2, None) if needs[0] else None
     to_pixels = torch.zeros((call.chunks, *pixels.shape), dtype=torch.float32, device="cpu") if needs[1] else None
     call.pixels_gradient = None if to_pixels is None else to_pixels.data_ptr()
     to_extra = None
@@ -375,7 +375,7 @@ def sample_views_backward(
         to_extra = torch.zeros((*front.shape, call.extra), dtype=torch.float32, device="cpu")
         call.extras_gradient = to_extra.data_ptr()
     _run(call, backward=True)
-    del kept
+    del alive
     return (
         None if to_source is None else saturating_cast(to_source, original.dtype),
         None if to_pixels is None else to_pixels.sum(0).to(pixels.dtype),
@@ -387,7 +387,7 @@ def plane_sweep_project(
     source: Tensor, sites: Sites, options: Options, out: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """As `reference.plane_sweep_project`; `out` is memory of the answer's shape, any strides, to write to."""
-    return _sample(*_lattice(VOLUMES, source, sites, options), source.dtype, options, out)
+    return _forward(*_lattice_call(PLANE_SWEEP_PROJECT, source, sites, options), source.dtype, options, out)
 
 
 def plane_sweep_project_backward(
@@ -399,4 +399,4 @@ def plane_sweep_project_backward(
     into: Tensor | None = None,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
     """Vector-Jacobian product of `plane_sweep_project`, as `unproject_backward`."""
-    return _lattice_backward(VOLUMES, gradient, source, sites, options, needs, into)
+    return _lattice_backward(PLANE_SWEEP_PROJECT, gradient, source, sites, options, needs, into)

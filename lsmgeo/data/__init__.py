@@ -1,4 +1,4 @@
-"""Images with known cameras from files, and shards of shapes to train on: one typed sample, whatever the format."""
+"""Images with known cameras from files, and shards of shapes for training: one typed sample for every format."""
 
 from lsmgeo._old_names import old_names
 from lsmgeo.data.atomic_files import atomic_file, write_atomic

@@ -27,23 +27,19 @@ __all__ = [
     "write_atomic",
 ]
 
-# What a killed process leaves behind: on its way in, also as earlier versions called it, or on its way out.
+# What a killed process leaves behind: a new file (also by the name of earlier versions), or a replaced folder.
 _LEFTOVER = re.compile(r"\..+\.tmp|.+\.tmp-\d+|(?P<name>.+)\.old-\d+")
 
 
 class AtomicFile:
-    """A file being written by `atomic_file`: bytes go in, and only whole does it take its place."""
+    """A file that `atomic_file` is writing."""
 
     def __init__(self, path: Path, descriptor: int) -> None:
         self.path = path
         self._descriptor = descriptor
 
     def write(self, content: bytes) -> None:
-        """Append bytes.
-
-        Raises:
-            DataError: the disk is full, and the like.
-        """
+        """Append bytes; a DataError if the disk is full, and the like."""
         rest = memoryview(content)
         with os_errors_as_data_errors(self.path):
             while rest:
@@ -52,19 +48,19 @@ class AtomicFile:
 
 @contextlib.contextmanager
 def atomic_file(path: str | os.PathLike[str]) -> Iterator[AtomicFile]:
-    """Write a file piece by piece so that it is either wholly there or not at all.
+    """Write a file piece by piece, atomically: it is complete or not there at all.
 
-    The bytes go to a temporary file beside the target, reach the disk, and replace the target in one step when the
-    block ends; parents are created. If the block raises, the target stays as it was and nothing half-written stays.
+    The bytes are written to a temporary file beside the target and synchronised to disk; it replaces the target in one
+    step when the block ends. Parent folders are created. If the block raises, the target is unchanged.
 
     Args:
         path: the file to write.
 
     Yields:
-        The file, with ``write(bytes)``.
+        The file, with a method ``write(bytes)``.
 
     Raises:
-        DataError: the folder or the file cannot be written. Errors of the block itself pass unchanged.
+        DataError: the folder or the file cannot be written. Errors of the block propagate unchanged.
     """
     path = Path(path)
     temporary, descriptor = _beside(path), -1
@@ -86,10 +82,10 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[AtomicFile]:
 
 
 def write_atomic(path: str | os.PathLike[str], content: bytes) -> Path:
-    """Write a file so that it is either wholly there or not at all, as `atomic_file` does.
+    """Write a file atomically, as `atomic_file` does.
 
     Raises:
-        DataError: the folder or the file cannot be written; nothing half-written stays.
+        DataError: the folder or the file cannot be written.
     """
     with atomic_file(path) as stream:
         stream.write(content)
@@ -98,33 +94,32 @@ def write_atomic(path: str | os.PathLike[str], content: bytes) -> Path:
 
 @contextlib.contextmanager
 def atomic_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Iterator[Path]:
-    """Fill a folder so that it is either wholly there or not at all.
+    """Write a folder atomically: it is complete or not there at all.
 
-    What the block writes goes to a temporary folder beside the target, which takes the target's name when the block
-    ends. If the block raises, nothing of it stays.
+    The block writes into a temporary folder beside the target, which is renamed to the target when the block ends. If
+    the block raises, the temporary folder is removed.
 
     Args:
         path: the folder to make. Parents are created.
-        replace: whether the folder may be there already. It is then renamed out of the way first: a kill between the
-            two steps leaves it as ``NAME.old-PID``, which `clear_leftovers` brings back. Otherwise the target must not
-            exist, or be empty.
+        replace: whether the folder may exist. It is then renamed first: a process killed between the two steps leaves
+            it as ``NAME.old-PID``, which `clear_leftovers` restores. Otherwise the target must not exist or be empty.
 
     Yields:
-        The temporary folder; files in it are best written by `write_atomic`, which brings them to the disk.
+        The temporary folder; write files in it with `write_atomic`, which synchronises them to disk.
 
     Raises:
-        DataError: something is there already, or the folder cannot be written. Errors of the block pass unchanged.
+        DataError: the target exists, or the folder cannot be written. Errors of the block propagate unchanged.
     """
     path = Path(path)
     temporary, is_current = _beside(path), False
     try:
         with os_errors_as_data_errors(path):
             if not replace and (path.is_symlink() or (path.exists() and (not path.is_dir() or any(path.iterdir())))):
-                raise DataError(path, "is there already and not an empty folder; name a new one")
+                raise DataError(path, "exists and is not an empty folder; choose another path")
             with contextlib.suppress(FileNotFoundError):
                 is_current = path.samefile(".")
             if is_current:
-                raise DataError(path, "is the current folder, which cannot be replaced; name a new one")
+                raise DataError(path, "is the current folder, which cannot be replaced; choose another path")
             _make_folder(path.parent)
             temporary.mkdir()
         yield temporary
@@ -136,7 +131,7 @@ def atomic_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Ite
 
 
 def is_abandoned(temporary: Path) -> bool:
-    """Whether the writer of a temporary file of `atomic_file` is gone: its lock ends with its process."""
+    """Whether the process that wrote a temporary file of `atomic_file` has ended: its lock ends with it."""
     descriptor = os.open(temporary, os.O_RDONLY)
     try:
         return _lock(descriptor)
@@ -145,7 +140,7 @@ def is_abandoned(temporary: Path) -> bool:
 
 
 def _lock(descriptor: int) -> bool:
-    """Take a file's lock; False where another process has it. Systems without locks always give it."""
+    """Take a file's lock; False if another process holds it, always True on systems without locks."""
     with contextlib.suppress(ImportError):
         import fcntl
 
@@ -159,11 +154,7 @@ def _lock(descriptor: int) -> bool:
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder so that a kill in the middle leaves all of it, or nothing but a leftover.
-
-    Raises:
-        DataError: it cannot be removed.
-    """
+    """Remove a folder; a process killed meanwhile leaves all of it, or a leftover. A DataError if that fails."""
     leftover = _beside(folder)
     with os_errors_as_data_errors(folder, "removed"):
         folder.replace(leftover)
@@ -171,10 +162,7 @@ def remove_folder(folder: Path) -> None:
 
 
 def clear_leftovers(folder: Path) -> None:
-    """Remove what a killed process left behind. Only who alone writes into the folder may do this.
-
-    Args:
-        folder: it need not exist.
+    """Remove what killed processes left in a folder, which need not exist; no other process may write into it.
 
     Raises:
         DataError: the folder cannot be read, or a file not removed.
@@ -193,7 +181,7 @@ def clear_leftovers(folder: Path) -> None:
 
 
 def _beside(path: Path) -> Path:
-    """A name in the same folder that nobody has: hidden, and known to `clear_leftovers`."""
+    """A new hidden name in the same folder, of the pattern of `clear_leftovers`."""
     return path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp"
 
 
@@ -204,7 +192,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _take_place(temporary: Path, path: Path) -> None:
-    # A folder cannot replace a full one in one step. Readers of checkpoints know the old one by its new name too.
+    # A folder cannot replace another in one step. Readers of checkpoints also accept the old one by its new name.
     old = path.with_name(f"{path.name}.old-{os.getpid()}")
     is_there = path.exists()
     if is_there:
@@ -219,7 +207,7 @@ def _take_place(temporary: Path, path: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Bring a folder's entries to the disk, where the system can: a rename is not kept before that."""
+    """Synchronise a folder's entries to disk, where the system can: only then is a rename durable."""
     try:
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -227,5 +215,5 @@ def _sync_folder(folder: Path) -> None:
         finally:
             os.close(descriptor)
     except OSError as error:
-        if error.errno in (errno.EIO, errno.ENOSPC, errno.EDQUOT):  # others: a system that syncs no folders
+        if error.errno in (errno.EIO, errno.ENOSPC, errno.EDQUOT):  # others: the system cannot synchronise folders
             raise

@@ -1,9 +1,9 @@
-"""Image files: images in, PNG out, and PNG of known size and kind in.
+"""Image files: PNG and JPEG are read as RGB or RGBA, PNG is written, and PNG of known size and kind is read.
 
-OpenCV refuses what is damaged, but it guesses the kind from the content, allocates what the file announces, and
-inflates what no pixel needs. So the container is looked at first: the header must be the expected one, every chunk must
-end inside the file, and the data must have the length of the pixels. Ancillary chunks (animation, transparency,
-comments) are not given to the decoder.
+OpenCV refuses damaged files, but it guesses the kind from the content, allocates what the file announces, and inflates
+data beyond the pixels. So the container is checked first: the header must be the expected one, every chunk must end
+inside the file, and the data must have the length of the pixels. Ancillary chunks (animation, transparency, comments)
+are not passed to the decoder.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ __all__ = [
     "read_image",
 ]
 
-# Room for the 24 and 61 megapixels of today's cameras, below the size at which Pillow itself suspects a bomb.
+# Above the 61 megapixels of today's cameras, below the size at which Pillow suspects a decompression bomb.
 MAX_PIXELS = 1 << 26
 MAX_IMAGE_BYTES = 4096 + 8 * MAX_PIXELS
-# What the names of images end with, in small letters.
+# Suffixes of image files, in lower case.
 SUFFIXES = (".png", ".jpg", ".jpeg")
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 LEVEL = 3
@@ -51,7 +51,7 @@ ENCODED = {np.dtype(np.uint8): ((), (3,), (4,)), np.dtype(np.uint16): ((),)}
 
 
 class PngKind(NamedTuple):
-    """What a PNG's pixels are: bits of a channel and PNG's colour type, and the array that they give."""
+    """The pixels of a PNG: bits per channel, PNG's colour type, and channels and dtype of the array."""
 
     bit_depth: int
     colour_type: int
@@ -64,7 +64,7 @@ DEPTH = PngKind(16, 0, (), np.dtype(np.uint16))
 
 
 def encode_png(pixels: np.ndarray) -> bytes:
-    """Write an image as PNG; equal pixels give equal bytes.
+    """Encode an image as PNG; equal pixels give equal bytes.
 
     Args:
         pixels: (H, W) grey, (H, W, 3) RGB or (H, W, 4) RGBA uint8, or (H, W) uint16.
@@ -89,7 +89,7 @@ def encode_png(pixels: np.ndarray) -> bytes:
     pixels = np.ascontiguousarray(pixels)
     if pixels.ndim == 3:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR if pixels.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
-    # Rows as differences to the row above: of all filters the smallest on flat shaded images and depth.
+    # Of all filters this one (the difference to the row above) gives the smallest files of shaded images and depth.
     options = (cv2.IMWRITE_PNG_COMPRESSION, LEVEL, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP)
     return bytes(cv2.imencode(".png", pixels, options)[1])
 
@@ -100,10 +100,10 @@ def decode_png(
     """Read a PNG of known size and kind.
 
     Args:
-        content: the file's bytes, from outside.
-        size: (height, width) that it must have.
+        content: the file's bytes, untrusted.
+        size: the expected (height, width).
         kind: `RGBA` or `DEPTH`.
-        path: the file that holds it, for errors.
+        path: the file that contains it, for errors.
         member: its name in that file, for errors.
 
     Returns:
@@ -147,7 +147,7 @@ def decode_png(
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """The (height, width) that a PNG or JPEG states in its header; no pixel is decoded.
+    """The (height, width) in the header of a PNG or JPEG; no pixel is decoded.
 
     Raises:
         DataError: not a PNG or JPEG, or more than `MAX_PIXELS`.
@@ -157,11 +157,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def has_alpha(path: Path) -> bool:
-    """Whether a PNG or JPEG says in its header that it has transparent pixels; none is decoded.
-
-    Raises:
-        DataError: as `image_size`.
-    """
+    """Whether a PNG or JPEG has transparency by its header; a DataError as for `image_size`."""
     with _open_image(path) as image:
         return image.mode in ("RGBA", "LA") or "transparency" in image.info
 
@@ -169,12 +165,11 @@ def has_alpha(path: Path) -> bool:
 def read_image(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
     """Read a PNG or JPEG image as 8-bit RGB.
 
-    The pixels come as they are stored: an orientation that EXIF states is not applied, as COLMAP and instant-ngp do not
-    apply it.
+    The pixels are returned as stored: like COLMAP and instant-ngp, it does not apply the orientation in EXIF.
 
     Args:
         path: the image file.
-        size: expected (height, width); checked before a pixel is decoded.
+        size: the expected (height, width), checked before a pixel is decoded.
 
     Returns:
         (H, W, 3) uint8.
@@ -186,11 +181,7 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
 
 
 def read_cut_out(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Read a PNG or JPEG as 8-bit RGBA, alpha 255 where it has none; otherwise as `read_image`.
-
-    Returns:
-        (H, W, 4) uint8, not premultiplied.
-    """
+    """(H, W, 4) uint8 RGBA of a PNG or JPEG, not premultiplied, alpha 255 where it has none; see `read_image`."""
     return _read(path, size, "RGBA")
 
 
@@ -210,17 +201,17 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
     from PIL import Image
 
     try:
-        # A pipe or a device would block or never end, so only plain files are opened at all.
+        # A pipe or a device could block or never end, so only regular files are opened.
         if not path.is_file():
             raise DataError(path, "no such file")
         if path.stat().st_size > MAX_IMAGE_BYTES:
             raise DataError(path, f"is larger than the limit of {MAX_IMAGE_BYTES} bytes")
         with warnings.catch_warnings():
-            # Pillow warns of palettes and of second images in a JPEG, which are read as they should be.
+            # Pillow warns of palettes and of second images in a JPEG, which are read correctly.
             warnings.simplefilter("ignore")
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            # Sniffing among all of Pillow's formats would reach parsers (EPS, FITS) that run programs or expand files.
-            # The file itself, not its bytes: of hundreds of images only the headers are read when a scene opens.
+            # Pillow's other formats include parsers (EPS, FITS) that run programs or expand files. The file is passed,
+            # not its bytes: opening a scene reads only the headers of hundreds of images.
             with path.open("rb") as stream, Image.open(stream, formats=("PNG", "JPEG")) as image:
                 width, height = image.size
                 if width * height > MAX_PIXELS:

@@ -1,4 +1,4 @@
-"""Parsers that a damaged file can crash, run where that does no harm: in a process of their own."""
+"""Parsers that a damaged file can crash run in an isolated process with limited memory and time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-# Nothing of this package: the file is also the script of the process, and importing the package takes seconds.
+# This file is also the script of the process, and importing the package takes seconds: so it imports none of it.
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
@@ -40,24 +40,24 @@ def parse_isolated(
     memory: int,
     seconds: float,
 ) -> list[Arrays | DataError]:
-    """Call ``function(content, *arguments)`` for files that may crash it, in another process, and return its arrays.
+    """Call ``function(content, *arguments)`` on files that may crash it, in another process, and return its arrays.
 
-    All files go to one process, since starting it takes longer than reading hundreds; when a file ends it, the rest
-    goes to another. The process is an isolated interpreter (``python -I``) that runs the function's source file alone.
-    It has limited memory and time, and leaves no core dump; systems without POSIX limits keep a limit of time. Its
-    answers are checked like a file, as hostile bytes may have taken it over: they hold plain arrays, no pickle.
+    One process parses all files, since starting it takes longer than parsing hundreds; if a file ends it, another one
+    parses the rest. The process is an isolated interpreter (``python -I``) that runs only the function's source file.
+    It has limited memory and time, and writes no core dump; without POSIX limits only time is limited. Its answers are
+    checked like a file, since a hostile file may control it: they contain plain arrays, no pickle.
 
     Args:
-        function: at the top of a file that imports nothing of this package, and little else, as each start imports it.
-            Whatever it raises refuses the file, and is the reason.
+        function: at the top level of a file that imports nothing of this package, and little else, as each start
+            imports it. An exception that it raises refuses the file, and is the reason.
         paths: the files.
-        arguments: what JSON can hold.
-        limit: most bytes of a file.
+        arguments: further arguments, as JSON can represent them.
+        limit: the largest file, in bytes.
         memory: address space in bytes, libraries included.
-        seconds: what a file may take. All together may take that and one second each.
+        seconds: the time limit of a file; that of all files is this and one second for each.
 
     Returns:
-        For each file the arrays (bool, numbers or text), or why it cannot be used.
+        For each file its arrays (bool, numbers or text), or the error of a file that cannot be used.
     """
     from lsmgeo.data.read_files import read_bytes
     from lsmgeo.errors import DataError
@@ -65,7 +65,7 @@ def parse_isolated(
     answers: dict[int, Arrays | DataError] = {}
     waiting = list(enumerate(paths))
     while waiting:
-        # One process's files are held at once: until they have 64 MiB together.
+        # The files of one process are held in memory at once: up to 64 MiB together.
         files, held = [], 0
         for number, path in waiting:
             if held > MOST_ASKED:
@@ -92,7 +92,7 @@ def _ask(
     order = json.dumps([memory, seconds, inspect.getsourcefile(function), function.__name__, arguments])
     parts = (order.encode(), *(content for _, content in files))
     content = b"".join(len(part).to_bytes(8, "little") + part for part in parts)
-    # Threads of linear algebra reserve address space for nothing.
+    # Threads of linear algebra libraries would reserve address space.
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     with tempfile.TemporaryFile() as output:
         try:
@@ -117,9 +117,9 @@ def _ask(
         for path, _ in files:
             try:
                 found = _received(output, reason)
-            # The process is believed no more than the file, and NumPy raises nearly everything on damaged arrays.
+            # The process is as untrusted as the file, and NumPy raises many kinds of errors on damaged arrays.
             except Exception:
-                return [*answers, DataError(path, "made its parser answer nonsense")]
+                return [*answers, DataError(path, "made its parser return an invalid answer")]
             if isinstance(found, str):
                 answers.append(DataError(path, "".join(c if c.isprintable() else "?" for c in found[:300])))
                 if found == reason:
@@ -130,7 +130,7 @@ def _ask(
 
 
 def _received(stream: BinaryIO, reason: str) -> Arrays | str:
-    """The next answer: arrays, or why there are none, which is ``reason`` where the process ended."""
+    """The next answer: arrays, or the reason why there are none, which is ``reason`` if the process ended."""
     line = stream.readline(MOST_NAMES)
     if not line.endswith(b"\n"):
         return reason
@@ -141,13 +141,13 @@ def _received(stream: BinaryIO, reason: str) -> Arrays | str:
     for name in answer["names"]:
         arrays[name] = array = np.lib.format.read_array(stream, allow_pickle=False)
         if not isinstance(name, str) or array.dtype.kind not in "biufU":
-            raise ValueError("no plain array")
+            raise ValueError("not a plain array")
     return arrays
 
 
 def _reason(code: int, seconds: float) -> str:
     if code >= 0:
-        return "made its parser fail" if code else "made its parser answer nonsense"
+        return "made its parser fail" if code else "made its parser return an invalid answer"
     name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
     return f"took its parser more than {seconds:g} seconds" if name == "SIGALRM" else f"crashed its parser ({name})"
 
@@ -159,7 +159,7 @@ def _next() -> bytes | None:
 
 
 def _serve() -> None:
-    """In the process: read what is asked on standard input, and answer for every file after it."""
+    """The process: read the request from standard input, then answer for each file."""
     memory, seconds, source, name, arguments = json.loads(_next() or b"")
     with contextlib.suppress(ImportError):
         import resource
@@ -170,11 +170,11 @@ def _serve() -> None:
             most = most if hard == resource.RLIM_INFINITY else min(most, hard)
             with contextlib.suppress(ValueError, OSError):
                 resource.setrlimit(kind, (most, most))
-    output, sys.stdout = sys.stdout.buffer, sys.stderr  # what a library prints is no answer
+    output, sys.stdout = sys.stdout.buffer, sys.stderr  # text that a library prints is not an answer
     function = runpy.run_path(source)[name]
     alarm = getattr(signal, "setitimer", None)
     while (content := _next()) is not None:
-        if alarm is not None:  # of which the process dies
+        if alarm is not None:  # SIGALRM ends the process
             alarm(signal.ITIMER_REAL, seconds)
         answer = io.BytesIO()
         try:

@@ -1,4 +1,4 @@
-"""JSON that nobody vouches for: bounded, without repeated keys, and numbers that are numbers."""
+"""Untrusted JSON files: limited size, no repeated keys, finite numbers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object.
 
     Raises:
-        DataError: the file is missing, too large, no JSON, nested without end, not an object, or says a key twice.
+        DataError: the file is missing, too large, not JSON, nested too deeply, not an object, or repeats a key.
     """
     values = _parse(path)
     if not isinstance(values, dict):
@@ -33,11 +33,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def sniff_json(path: Path) -> dict[str, Any]:
-    """The JSON object of a file for telling whose it is, empty where it holds some other JSON.
-
-    Raises:
-        DataError: as `read_json`, but for what is no object.
-    """
+    """The JSON object of a file, to detect its format; empty for JSON that is not an object."""
     values = _parse(path)
     return values if isinstance(values, dict) else {}
 
@@ -45,46 +41,34 @@ def sniff_json(path: Path) -> dict[str, Any]:
 def _parse(path: Path) -> Any:
     text = read_text(path, MAX_JSON_BYTES)
     try:
-        # int() of a long text is refused by Python itself; deep nesting ends in a RecursionError.
+        # Python itself refuses int() of a long text; deep nesting raises a RecursionError.
         return json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_without_repeats)
     except (ValueError, RecursionError) as error:
-        raise DataError(path, f"is not JSON that can be used ({error})") from error
+        raise DataError(path, f"is not JSON ({error})") from error
 
 
 def read_number(values: Mapping[str, Any], key: str, path: Path, where: str, *, beyond: float = 1e12) -> float:
-    """The number under a key, between -``beyond`` and ``beyond``.
-
-    Raises:
-        DataError: there is none, or it is no such number.
-    """
+    """The number of a key, between -``beyond`` and ``beyond``; a DataError if there is none."""
     value: Any = values.get(key)
-    # true is an int in Python, and an int of any length passes as a number until it is converted.
+    # true is an int in Python, and converting a very long int would raise.
     if type(value) not in (float, int) or not -beyond <= value <= beyond:
         raise DataError(path, f"{where}: {key} must be a number of at most {beyond:g}; got {describe(value)}")
     return float(value)
 
 
 def read_string(values: dict[str, Any], key: str, path: Path, where: str) -> str:
-    """The text under a key.
-
-    Raises:
-        DataError: there is none.
-    """
+    """The string of a key; a DataError if there is none."""
     value = values.get(key)
     if not isinstance(value, str):
-        raise DataError(path, f"{where}: {key} must be a text; got {describe(value)}")
+        raise DataError(path, f"{where}: {key} must be a string; got {describe(value)}")
     return value
 
 
 def read_array(values: dict[str, Any], key: str, shape: tuple[int, ...], path: Path, where: str) -> np.ndarray:
-    """The array of finite numbers under a key, float64, nested lists of exactly this shape.
-
-    Raises:
-        DataError: there is none, or it has another shape, or holds what is no number below 1e12.
-    """
+    """The float64 array of a key, nested lists of exactly this shape; a DataError for all else, or beyond 1e12."""
     rows: list[Any] = [values.get(key)]
     for length in shape:
-        # Lengths first: numpy would make an array of objects of ragged lists, and numbers of strings.
+        # Lengths first: numpy accepts ragged lists as an array of objects, and converts strings to numbers.
         if any(not isinstance(row, list) or len(row) != length for row in rows):
             expected = " x ".join(map(str, shape))
             raise DataError(path, f"{where}: {key} must be {expected} numbers; got {describe(values.get(key))}")
@@ -101,5 +85,5 @@ def _refuse_constant(name: str) -> float:
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     values = dict(pairs)
     if len(values) != len(pairs):
-        raise ValueError("says a key twice")
+        raise ValueError("uses a key twice")
     return values

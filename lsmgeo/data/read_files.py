@@ -35,12 +35,7 @@ Content = TypeVar("Content")
 
 @contextlib.contextmanager
 def os_errors_as_data_errors(path: str | os.PathLike[str], what: str = "written") -> Iterator[None]:
-    """Make what the system says in a block (no permission, a full disk, a name too long) a `DataError`.
-
-    Args:
-        path: the file or folder that is meant.
-        what: what cannot be done with it.
-    """
+    """Turn an OSError of a block (no permission, a full disk, a name too long) into a DataError: cannot be `what`."""
     try:
         yield
     except DataError:
@@ -50,7 +45,7 @@ def os_errors_as_data_errors(path: str | os.PathLike[str], what: str = "written"
 
 
 def file_reader(read: Callable[Options, Content]) -> Callable[Options, Content]:
-    """Make what the system says while a reader looks around a `DataError` of the path, its first argument."""
+    """Decorate a reader: its OSErrors become DataErrors of the path, its first argument."""
 
     @functools.wraps(read)
     def reading(*args: Options.args, **options: Options.kwargs) -> Content:
@@ -61,17 +56,13 @@ def file_reader(read: Callable[Options, Content]) -> Callable[Options, Content]:
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
-    """Read a regular file of at most ``limit`` bytes.
-
-    Raises:
-        DataError: the file is missing, not a plain file, unreadable, or larger than ``limit``.
-    """
+    """Read a regular file of at most ``limit`` bytes; all else raises a DataError."""
     with os_errors_as_data_errors(path, "read"):
-        # A pipe or a device would block or never end, so only plain files are opened at all.
+        # A pipe or a device could block or never end, so only regular files are opened.
         if not path.is_file():
             raise DataError(path, "no such file")
         with path.open("rb") as stream:
-            # Reading up to a limit takes memory for all of it.
+            # Python allocates the number of bytes that it is asked for.
             content = stream.read(min(os.fstat(stream.fileno()).st_size, limit) + 1)
     if len(content) > limit:
         raise DataError(path, f"is larger than the limit of {limit} bytes")
@@ -79,13 +70,9 @@ def read_bytes(path: Path, limit: int) -> bytes:
 
 
 def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:
-    """Read a UTF-8 text file of at most ``limit`` bytes.
-
-    Raises:
-        DataError: as :func:`read_bytes`, or the content is not UTF-8 text.
-    """
+    """Read a UTF-8 text file of at most ``limit`` bytes; all else raises a DataError."""
     try:
-        # Windows puts a mark of byte order before its UTF-8.
+        # Windows writes a byte order mark before UTF-8.
         text = read_bytes(path, limit).decode("utf-8").removeprefix("\ufeff")
     except UnicodeDecodeError as error:
         raise DataError(path, "is not a text file (invalid UTF-8)") from error
@@ -95,15 +82,15 @@ def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:
 
 
 def path_inside(root: Path, name: str, source: Path) -> Path:
-    """The path of ``name`` below ``root``, refusing every name that leads outside.
+    """The path of ``name`` below ``root``; a name that leads outside is an error.
 
     Args:
-        root: folder that must contain the result.
-        name: relative name as written in ``source``.
-        source: the file that gave the name, for the error message.
+        root: the folder that must contain the result.
+        name: a relative name, as ``source`` states it.
+        source: the file that states the name, for errors.
 
     Raises:
-        DataError: the name is empty, absolute, not printable, or leads outside ``root`` (also through a link).
+        DataError: the name is empty, absolute or not printable, or leads outside ``root``, also through a link.
     """
     if not name or len(name) > 512 or not name.isprintable():
         raise DataError(source, f"holds an unusable file name {name[:80]!r}")
@@ -118,30 +105,22 @@ def path_inside(root: Path, name: str, source: Path) -> Path:
 
 
 def plain_files(folder: Path, *patterns: str) -> list[Path]:
-    """The plain files of a folder, sorted, that match the first of the patterns that any matches."""
+    """The regular files of a folder, sorted, that match the first pattern with a match."""
     found = (sorted(path for path in folder.glob(pattern) if path.is_file()) for pattern in patterns)
     return next(filter(None, found), [])
 
 
 def one_file(path: Path, *patterns: str) -> Path:
-    """The path itself where it is no folder, else the one file in it, see `plain_files`.
-
-    Raises:
-        DataError: the folder holds none, or several.
-    """
+    """The path itself if it is not a folder, else the one file in it (see `plain_files`); a DataError if not one."""
     files = plain_files(path, *patterns) if path.is_dir() else [path]
     if len(files) != 1:
         found = ", ".join(file.name for file in files[:5]) or "none"
-        raise DataError(path, f"expected one file {' or '.join(patterns)}; found {found}: name the one meant")
+        raise DataError(path, f"expected one file {' or '.join(patterns)}; found {found}: pass the path of one file")
     return files[0]
 
 
 def parse_floats(tokens: Sequence[str], path: Path, where: str, *, finite: bool = True) -> list[float]:
-    """Numbers from text, finite ones unless others are asked for.
-
-    Raises:
-        DataError: a token is not a number, is not finite or is absurdly long.
-    """
+    """Numbers from text, by default finite; a DataError if a token is not such a number, or is far too long."""
     try:
         if any(len(token) > MAX_NUMBER_LENGTH for token in tokens):
             raise ValueError("number too long")
@@ -154,11 +133,7 @@ def parse_floats(tokens: Sequence[str], path: Path, where: str, *, finite: bool 
 
 
 def parse_ints(tokens: Sequence[str], path: Path, where: str) -> list[int]:
-    """Whole numbers from text that fit 64 bits.
-
-    Raises:
-        DataError: a token is not a whole number or needs more than 64 bits.
-    """
+    """Integers from text; a DataError if a token is not an integer of 64 bits."""
     try:
         if any(len(token) > 20 for token in tokens):
             raise ValueError("number too long")

@@ -1,4 +1,4 @@
-"""What a training step is fed: `Sample`, one shape with its views, and `Batch`, several of them."""
+"""The input of models: `Sample`, one shape with its views, and `Batch`, several samples."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ from lsmgeo.errors import DTypeError, ShapeError
 __all__ = ["MAX_VIEWS", "Batch", "Sample", "check_sample", "collate", "first_views", "pad_with_first", "pad_with_zeros"]
 
 
-# Of a shape, in a set of shapes.
-MAX_VIEWS = 1000
+MAX_VIEWS = 1000  # of a shape in a set
 
 
 class Sample(NamedTuple):
     """One shape, or one scene, and V views of it; all views are of one size.
 
     Convention:
-        Depth is camera z in world units, 0 where nothing is seen. Occupancy fills [-0.5, 0.5]^3 of the world, voxel i
+        Depth is camera z in world units, 0 for background. Occupancy fills [-0.5, 0.5]^3 of the world, voxel i
         of n centred at ``-0.5 + (i + 0.5) / n``.
 
     Attributes:
@@ -34,9 +33,9 @@ class Sample(NamedTuple):
         depth: (V, H, W) float32, or None.
         mask: (V, H, W) bool, True on the object, or None.
         occupancy: (D, H, W) bool, or None.
-        mesh: path of the mesh it was made from, or None.
+        mesh: path of the mesh that it was made from, or None.
         category: name of its category, or None.
-        name: a name that is unique in its set.
+        name: unique in its set.
     """
 
     images: Tensor
@@ -50,10 +49,10 @@ class Sample(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """B samples of V views, V the largest of theirs: a pytree, so loaders pin it and compilers trace it.
+    """B samples, padded to V views, the most of any sample. A pytree: data loaders can pin it and compilers trace it.
 
-    What is missing from a sample with fewer views is filled: images and depth with 0, mask with False, cameras with a
-    copy of its first. `view_mask` tells which views are there, and every operator of the library takes it.
+    Padding views have images and depth 0, mask False and a copy of the first camera. `view_mask` marks the views that
+    exist; every operator of the library takes it.
 
     Attributes:
         images: (B, V, 3, H, W) float32 in [0, 1].
@@ -61,7 +60,7 @@ class Batch(NamedTuple):
         depth: (B, V, H, W) float32, or None.
         mask: (B, V, H, W) bool, or None.
         occupancy: (B, D, H, W) bool, or None.
-        mesh: B paths or Nones. Pinned by a loader, the three tuples come as lists.
+        mesh: B paths or Nones. A loader that pins memory returns this and the next two as lists.
         category: B names or Nones.
         name: B names.
         view_mask: (B, V) bool.
@@ -78,16 +77,16 @@ class Batch(NamedTuple):
     view_mask: Tensor
 
     def first_views(self, views: int) -> Batch:
-        """The same shapes with their first views only.
+        """The same shapes with only their first views.
 
         Args:
-            views: how many, at least 1; all where there are fewer.
+            views: how many, at least 1; all views if there are fewer.
 
         Returns:
             A batch of min(views, V) views, whose tensors are views of this one's.
 
         Raises:
-            OptionError: no such number.
+            OptionError: not such a number.
         """
         check_whole("Batch", "views", views, 1)
         return self._replace(
@@ -108,15 +107,15 @@ def check_sample(sample: Sample, who: str = "sample") -> CameraTensors:
     """Check the types, shapes and dtypes of a sample's fields, and that cameras and images are of one size.
 
     Args:
-        sample: what a reader or a renderer made.
-        who: what stands before the field's name in errors.
+        sample: of a reader or a renderer.
+        who: the function's name in errors.
 
     Returns:
-        Its cameras with sizes as tensors.
+        The cameras, with sizes as tensors.
 
     Raises:
-        DTypeError: a field is not of its type or dtype.
-        ShapeError: shapes do not belong together.
+        DTypeError: a field has another type or dtype.
+        ShapeError: shapes do not match.
         DeviceError: tensors are on different devices.
 
     Example:
@@ -162,18 +161,18 @@ def check_sample(sample: Sample, who: str = "sample") -> CameraTensors:
 
 
 def collate(samples: Sequence[Sample]) -> Batch:
-    """Make a batch of samples: views are padded to the largest number of them; for ``DataLoader(collate_fn=...)``.
+    """Make a batch of samples, padded to the most views of any; for ``DataLoader(collate_fn=...)``.
 
     Args:
         samples: at least one; images of one size, cameras of one dtype, occupancy of one shape. A field is None in all
-            samples or in none.
+            samples or in none of them.
 
     Returns:
         The batch.
 
     Raises:
-        DTypeError: no sample, something else than samples, or cameras of different dtypes.
-        ShapeError: sizes differ, or a field is None in some samples only.
+        DTypeError: no samples, other objects, or cameras of different dtypes.
+        ShapeError: sizes differ, or a field is None in only some samples.
 
     Example:
         >>> import torch
@@ -196,7 +195,7 @@ def collate(samples: Sequence[Sample]) -> Batch:
             if (ours is None) != (theirs is None):
                 given, missing = (i, 0) if theirs is None else (0, i)
                 raise ShapeError(
-                    f"collate: {field} must be there in all samples or in none; "
+                    f"collate: {field} must be given in all samples or in none; "
                     f"samples[{given}] ({samples[given].name!r}) has it, samples[{missing}] "
                     f"({samples[missing].name!r}) has not"
                 )
@@ -232,17 +231,17 @@ def _agree(index: int, what: str, ours: tuple[int, ...], theirs: tuple[int, ...]
 
 
 def _stacked(parts: list[Tensor]) -> Tensor:
-    """Tensors of one shape as one, in a loader's worker at once in the memory that it shares with the training loop."""
+    """Stack tensors; in a worker of a loader directly into shared memory."""
     return default_collate(parts)
 
 
 def pad_with_zeros(parts: Sequence[Tensor]) -> Tensor:
-    """(V_i, ...) tensors as one (B, V, ...), the rest 0."""
+    """Stack (V_i, ...) tensors as (B, V, ...), padded with 0."""
     return _padded(parts, [part.new_zeros((1, *part.shape[1:])) for part in parts])
 
 
 def pad_with_first(parts: Sequence[Tensor]) -> Tensor:
-    """(V_i, ...) tensors as one (B, V, ...), the rest copies of each one's first."""
+    """Stack (V_i, ...) tensors as (B, V, ...), padded with copies of the first entry of each."""
     return _padded(parts, [part[:1] for part in parts])
 
 

@@ -38,7 +38,7 @@ def test_distortion_is_said_to_be_gone(scene, tmp_path, capsys):
     [
         (["--to", "nerf"], "to must be one of"),
         (["--to", "colmap"], "cameras must have no skew"),
-        (["--to", "cameras", "--out", "{source}"], "is there already and not an empty folder"),
+        (["--to", "cameras", "--out", "{source}"], "exists and is not an empty folder"),
         (["--to", "cameras", "--jobs", "2"], "splits and jobs are for shards"),
     ],
 )

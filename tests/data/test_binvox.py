@@ -87,7 +87,7 @@ def test_a_folder_with_one_solid(tmp_path):
     assert bool(data.read_binvox(tmp_path).occupancy.all())
     (tmp_path / "renamed").write_bytes(path.read_bytes())
     assert data.detect(tmp_path / "renamed").name == "binvox"
-    with pytest.raises(DataError, match="no posed images"):
+    with pytest.raises(DataError, match="but no posed images"):
         data.open(path)
     (tmp_path / "other.binvox").write_bytes(path.read_bytes())
     with pytest.raises(DataError, match="expected one"):
@@ -107,36 +107,36 @@ FULL = bytes((1, 8))
 @pytest.mark.parametrize(
     ("content", "match"),
     [
-        (b"", "no header"),
-        (b"#binvox 1", "no header"),
-        (b"#binvox 2" + HEADER[9:] + FULL, "no binvox file"),
-        (b"#binvox 1\n" + b"# talk\n" * 200 + HEADER[10:] + FULL, "no header.* in its first 1024 bytes"),
-        (b"#binvox 1\n" + b"x" * 100_000, "no header"),
-        (HEADER[:-6] + b"\n" + FULL, "no header|no plain text|is none"),
-        (HEADER[:20] + b"\xff" + HEADER[20:] + FULL, "no plain text|is none"),
+        (b"", "no binvox header"),
+        (b"#binvox 1", "no binvox header"),
+        (b"#binvox 2" + HEADER[9:] + FULL, "not a binvox file"),
+        (b"#binvox 1\n" + b"# talk\n" * 200 + HEADER[10:] + FULL, "no binvox header.* in its first 1024 bytes"),
+        (b"#binvox 1\n" + b"x" * 100_000, "no binvox header"),
+        (HEADER[:-6] + b"\n" + FULL, "no binvox header|not ASCII text|invalid or repeated"),
+        (HEADER[:20] + b"\xff" + HEADER[20:] + FULL, "not ASCII text|invalid or repeated"),
         (header(dim="0 0 0") + FULL, "expected 1 to 645"),
         (header(dim="-2 -2 2") + FULL, "expected 1 to 645"),
         (header(dim="1024 1024 1024") + FULL, "expected 1 to 645"),
         (header(dim="1000000000000000 1 1") + FULL, "expected 1 to 645"),
         (header(dim="99999999999999999999999 1 1") + FULL, "number too long"),
         (header(dim="640 640 640") + FULL, "runs of 8 voxels"),
-        (header(dim="2 2 4") + bytes((1, 16)), "order writers disagree"),
-        (header(dim="2 2") + FULL, "is none"),
+        (header(dim="2 2 4") + bytes((1, 16)), "writers disagree on their order"),
+        (header(dim="2 2") + FULL, "invalid or repeated"),
         (header(dim="2.0 2 2") + FULL, "whole numbers"),
-        (header(scale="0") + FULL, "no place for a cube"),
-        (header(scale="-1") + FULL, "no place for a cube"),
+        (header(scale="0") + FULL, "not a valid cube"),
+        (header(scale="-1") + FULL, "not a valid cube"),
         (header(scale="nan") + FULL, "finite"),
         (header(scale="1e999") + FULL, "finite"),
         (header(scale="1e-30", translate="1e9 0 0") + FULL, "scale too small"),
-        (header(translate="1e30 0 0") + FULL, "no place for a cube"),
-        (header(colour="red") + FULL, "is none"),
-        (HEADER[:-5] + b"scale 2\ndata\n" + FULL, "twice"),
+        (header(translate="1e30 0 0") + FULL, "not a valid cube"),
+        (header(colour="red") + FULL, "invalid or repeated"),
+        (HEADER[:-5] + b"scale 2\ndata\n" + FULL, "invalid or repeated"),
         (HEADER[:-5].replace(b"scale 1\n", b"") + b"data\n" + FULL, "without scale"),
         (HEADER, "runs of 0 voxels"),
         (HEADER + bytes((1, 7)), "runs of 7 voxels"),
         (HEADER + bytes((1, 9)), "runs of 9 voxels"),
         (HEADER + bytes((1, 4, 7, 4)), "other than 0 and 1"),
-        (HEADER + bytes((1, 8, 0, 0)), "run that is empty"),
+        (HEADER + bytes((1, 8, 0, 0)), "an empty run"),
         (HEADER + FULL + b"\n", "ends inside a run"),
         (HEADER + FULL + FULL, "runs of 16 voxels"),
     ],

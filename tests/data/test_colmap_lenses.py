@@ -148,7 +148,7 @@ def test_a_camera_without_distortion_needs_no_lens(scene, tmp_path, model, param
 @pytest.mark.parametrize("form", ["bin", "txt"])
 def test_cameras_that_opencv_lacks_are_refused_by_name(scene, tmp_path, model, parameters, form):
     write(scene, tmp_path, model, parameters, form)
-    with pytest.raises(DataError, match=f"camera model {model} is none of OpenCV's; undistort first"):
+    with pytest.raises(DataError, match=f"camera model {model} does not exist in OpenCV; undistort first"):
         data.open(tmp_path)
 
 

@@ -91,8 +91,8 @@ def test_binary_files_are_read_to_their_end(tmp_path, name):
         ("cameras.txt", "2 PINHOLE", "2 MAGIC", "unknown camera model"),
         ("cameras.txt", "2 PINHOLE", "1 PINHOLE", "twice"),
         ("cameras.txt", "2 PINHOLE", "77 PINHOLE", "does not exist"),
-        ("cameras.txt", "PINHOLE 32 24", "PINHOLE 0 24", "impossible size"),
-        ("cameras.txt", "PINHOLE 32 24", "PINHOLE 999999999 24", "impossible size"),
+        ("cameras.txt", "PINHOLE 32 24", "PINHOLE 0 24", "invalid size"),
+        ("cameras.txt", "PINHOLE 32 24", "PINHOLE 999999999 24", "invalid size"),
         ("cameras.txt", "PINHOLE 32 24", "PINHOLE 32", "whole numbers"),
         ("cameras.txt", "PINHOLE 32 24 1", "PINHOLE 32 24 -1", "positive"),
         ("images.txt", " v1.png", " ../v1.png", "outside its folder"),
@@ -122,7 +122,7 @@ def test_a_binary_camera_that_opencv_lacks_is_named(tmp_path):
     content = bytearray(file.read_bytes())
     content[12] = 7
     file.write_bytes(bytes(content))
-    scene_refused(tmp_path, "camera model FOV is none of OpenCV's; undistort first")
+    scene_refused(tmp_path, "camera model FOV does not exist in OpenCV; undistort first")
 
 
 def test_other_folders_say_what_is_missing(tmp_path):

@@ -26,17 +26,17 @@ XML = '<?xml version="1.0"?>\n<opencv_storage>\n{}\n</opencv_storage>\n'
 IDENTITY = "1., 0., 0., 0., 1., 0., 0., 0., 1."
 SHIFT = matrix("T", "0., 0., 1.", 3, 1)
 ATTACKS = [
-    ("a.yml", "", "no file of OpenCV"),
-    ("a.yml", HEAD, "states no camera matrix|no file of OpenCV"),
-    ("a.yml", "/etc/passwd", "no file of OpenCV"),
-    ("a.yml", "/etc/passwd?base64", "no file of OpenCV"),
-    ("a.yml", HEAD + "camera_matrix: [ [ [ [", "no file of OpenCV"),
-    ("a.xml", XML.format("<a>" * 100_000), "no file of OpenCV|crashed|memory|made its parser"),
-    ("a.json", '{"a":' * 100_000, "no file of OpenCV|crashed|memory|made its parser"),
-    ("a.yml", HEAD + matrix("camera_matrix", "1.", 2**30, 2**30), "states no camera matrix"),
-    ("a.yml", HEAD + matrix("camera_matrix", "1.", -3, -3), "states no camera matrix"),
+    ("a.yml", "", "not a file of OpenCV"),
+    ("a.yml", HEAD, "has no camera matrix|not a file of OpenCV"),
+    ("a.yml", "/etc/passwd", "not a file of OpenCV"),
+    ("a.yml", "/etc/passwd?base64", "not a file of OpenCV"),
+    ("a.yml", HEAD + "camera_matrix: [ [ [ [", "not a file of OpenCV"),
+    ("a.xml", XML.format("<a>" * 100_000), "not a file of OpenCV|crashed|memory|made its parser"),
+    ("a.json", '{"a":' * 100_000, "not a file of OpenCV|crashed|memory|made its parser"),
+    ("a.yml", HEAD + matrix("camera_matrix", "1.", 2**30, 2**30), "has no camera matrix"),
+    ("a.yml", HEAD + matrix("camera_matrix", "1.", -3, -3), "has no camera matrix"),
     ("a.yml", HEAD + matrix("camera_matrix", IDENTITY, 1, 9), "must be 3 x 3"),
-    ("a.yml", HEAD + matrix("camera_matrix", "1., " * 200_000 + "1."), "states no camera matrix"),
+    ("a.yml", HEAD + matrix("camera_matrix", "1., " * 200_000 + "1."), "has no camera matrix"),
     ("a.yml", HEAD + matrix("camera_matrix", IDENTITY.replace("1., 0.", ".Nan, 0.", 1)), "finite"),
     ("a.yml", HEAD + matrix("camera_matrix", IDENTITY.replace("1., 0.", ".Inf, 0.", 1)), "finite"),
     ("a.yml", HEAD + matrix("camera_matrix", IDENTITY.replace("1., 0.", "1e9, 0.", 1)), "beyond"),
@@ -45,9 +45,9 @@ ATTACKS = [
     ("a.yml", HEAD + matrix("camera_matrix", IDENTITY.replace("1., 0.", "1., 0.5", 1)), "skew"),
     ("a.yml", HEAD + LENS.replace("rows: 5", "rows: 6").replace("0.24", "0.24, 1."), "coefficients of distortion"),
     ("a.yml", HEAD + LENS.replace("0.24", "1e9"), "coefficient of distortion beyond"),
-    ("a.yml", HEAD + LENS + matrix("M", IDENTITY), "mean the same"),
+    ("a.yml", HEAD + LENS + matrix("M", IDENTITY), "are synonyms"),
     ("a.yml", HEAD + LENS + matrix("Camera_Matrix", IDENTITY), "capitals or underscores"),
-    ("a.yml", HEAD + LENS + matrix("camera_matrix", IDENTITY), "one twice|no file"),
+    ("a.yml", HEAD + LENS + matrix("camera_matrix", IDENTITY), "a repeated one|not a file"),
     ("a.yml", HEAD + LENS.replace("640", "6.5"), "whole numbers"),
     ("a.yml", HEAD + LENS.replace("640", "2000000"), "whole numbers"),
     ("a.yml", HEAD + LENS.replace("board_width: 9", "board_width: 1"), "2 corners"),
@@ -57,13 +57,13 @@ ATTACKS = [
     ("a.yml", HEAD + matrix("R", IDENTITY) + matrix("T", "0., 0.", 2, 1), "T three numbers"),
     ("a.yml", HEAD + matrix("R", "2., 0., 0., 0., 2., 0., 0., 0., 2.") + SHIFT, "scaled by 2"),
     ("a.yml", HEAD + matrix("R", IDENTITY[:-2] + "-1.") + SHIFT, "mirrored"),
-    ("a.yml", HEAD + matrix("R", "9e9, 0., 0.", 3, 1) + SHIFT, "more than a turn"),
+    ("a.yml", HEAD + matrix("R", "9e9, 0., 0.", 3, 1) + SHIFT, "more than 360 degrees"),
     ("a.xml", XML.format("<l>\n../left.jpg ../right.jpg</l>"), "outside its folder"),
     ("a.xml", XML.format("<l>\n/etc/a.jpg /etc/b.jpg</l>"), "outside its folder"),
     ("a.xml", XML.format("<l>\na.jpg a.jpg</l>"), "twice"),
     ("a.xml", XML.format("<l>\na.jpg b.jpg</l><m>\nc.jpg d.jpg</m>"), "lists images"),
-    ("a.xml", '<!DOCTYPE a [<!ENTITY x SYSTEM "/etc/passwd">]>\n' + XML.format("<a>&x;</a>"), "no file of OpenCV"),
-    ("a.json", '{"camera_matrix": {"type_id": "opencv-matrix", "rows": 3}}', "states no camera matrix"),
+    ("a.xml", '<!DOCTYPE a [<!ENTITY x SYSTEM "/etc/passwd">]>\n' + XML.format("<a>&x;</a>"), "not a file of OpenCV"),
+    ("a.json", '{"camera_matrix": {"type_id": "opencv-matrix", "rows": 3}}', "has no camera matrix"),
     ("a.yml", HEAD + LENS + "\0", "zero byte"),
     ("a.yml", HEAD + "# " + "x" * (1 << 22), "larger than"),
 ]  # fmt: skip
@@ -93,14 +93,14 @@ def test_calibrations_are_checked(parsed, monkeypatch, index):
 
 def test_nesting_without_end_kills_the_parser_alone(tmp_path):
     (tmp_path / "a.yml").write_text(HEAD + "camera_matrix: " + "[" * 100_000)
-    with pytest.raises(DataError, match=r"crashed its parser|made its parser fail|no file of OpenCV"):
+    with pytest.raises(DataError, match=r"crashed its parser|made its parser fail|not a file of OpenCV"):
         data.read_calibration(tmp_path / "a.yml")
 
 
 def test_files_that_state_the_same_are_named(tmp_path):
     folder = write_rig(tmp_path)
     (folder / "other.yml").write_bytes((folder / "intrinsics.yml").read_bytes())
-    with pytest.raises(DataError, match=r"states the lens 'first', and so does intrinsics\.yml"):
+    with pytest.raises(DataError, match=r"states the lens 'first' as intrinsics\.yml"):
         data.read_calibration(folder)
     (folder / "other.yml").write_bytes((folder / "extrinsics.yml").read_bytes())
     with pytest.raises(DataError, match=r"states R and T, and so does extrinsics\.yml"):

@@ -132,7 +132,7 @@ def test_a_key_said_twice_is_refused(tmp_path, form):
     for key in ("w", "transform_matrix", "frames") if form == "transforms" else ("width", "K", "version"):
         at = text.index(f'"{key}": ')
         file.write_text(f'{text[:at]}"{key}": 1, {text[at:]}')
-        scene_refused(tmp_path, "says a key twice")
+        scene_refused(tmp_path, "uses a key twice")
 
 
 @pytest.mark.parametrize("value", [1e999, 10**400, True, "5", None, [], 1e13], ids=lambda value: str(value)[:9])

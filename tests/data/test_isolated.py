@@ -8,6 +8,7 @@ import numpy as np
 from lsmgeo.data.isolated import parse_isolated
 from lsmgeo.errors import DataError
 
+NO_ANSWER = "made its parser return an invalid answer"
 HEAD = "import os, sys\nimport numpy as np\ndef parse(content, *arguments):\n"
 
 
@@ -55,7 +56,7 @@ def test_each_failure_is_that_of_its_file(tmp_path):
         "os.kill(os.getpid(), 11)": "crashed its parser (SIGSEGV)",
         "os.abort()": "crashed its parser (SIGABRT)",
         "os._exit(7)": "made its parser fail",
-        "os._exit(0)": "made its parser answer nonsense",
+        "os._exit(0)": NO_ANSWER,
         "import time; time.sleep(60)": "took its parser more than 1 seconds",
         "while True: pass": "took its parser more than 1 seconds",
         "raise RuntimeError('bad \\x1b')": "bad ?",
@@ -64,10 +65,10 @@ def test_each_failure_is_that_of_its_file(tmp_path):
         "np.ones(1 << 31)": "needs more than 1073741824 bytes of memory to be read",
         "return 3": "'int' object is not iterable",
         "return {'a': np.array([None])}": "Object arrays cannot be saved when allow_pickle=False",
-        "return {'a': np.zeros(3, 'c16')}": "made its parser answer nonsense",
-        'os.write(1, b\'{"names": ["a"]}\\n\\x93NUMPY\\x01\\x00\'); os._exit(0)': "made its parser answer nonsense",
-        "os.write(1, b'[' * 99_999 + b'\\n'); os._exit(0)": "made its parser answer nonsense",
-        "os.write(1, b'x' * (1 << 21))\nraise OSError('unwritten')": "made its parser answer nonsense",
+        "return {'a': np.zeros(3, 'c16')}": NO_ANSWER,
+        'os.write(1, b\'{"names": ["a"]}\\n\\x93NUMPY\\x01\\x00\'); os._exit(0)': NO_ANSWER,
+        "os.write(1, b'[' * 99_999 + b'\\n'); os._exit(0)": NO_ANSWER,
+        "os.write(1, b'x' * (1 << 21))\nraise OSError('unwritten')": NO_ANSWER,
     }
     bodies = [f"if content == b'{number}':\n" + "\n".join("    " + line for line in way.split("\n"))
               for number, way in enumerate(ways)]  # fmt: skip

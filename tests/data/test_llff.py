@@ -86,9 +86,9 @@ def mirrored(scene):
         (lambda s: llff_rows(s, FOCAL).astype(np.int64), "must hold float32 or float64; got int64"),
         (lambda s: llff_rows(s, FOCAL).astype(np.float16), "float32 or float64"),
         (lambda s: changed(s, c3=np.nan), "not finite"),
-        (lambda s: changed(s, c14=-3.0), "focal length of -3 make no camera"),
-        (lambda s: changed(s, c4=0.0), "make no camera"),
-        (lambda s: changed(s, c4=64.0, c9=48.0), "another shape, so K cannot follow"),
+        (lambda s: changed(s, c14=-3.0), "focal length of -3 are not a camera"),
+        (lambda s: changed(s, c4=0.0), "are not a camera"),
+        (lambda s: changed(s, c4=64.0, c9=48.0), "another shape"),
         (mirrored, "row 1: the rotation is mirrored"),
     ],
 )

@@ -54,11 +54,11 @@ def entry(**changes):
         (lambda values: values.update(version=True), "version bool True"),
         (lambda values: values.update(pixel_center="corner"), "pixel_center must be one of integer, half"),
         (lambda values: values.update(cameras=[]), "cameras must be a list of 1 to"),
-        (entry(width=128, height=96), "camera 1: the camera is of 128 x 96 pixels and 'v1.png' has 59 x 45"),
+        (entry(width=128, height=96), "camera 1: the camera has 128 x 96 pixels and 'v1.png' has 59 x 45"),
         (entry(width=59.5), "whole numbers"),
         (entry(width="59"), "width must be a number"),
         (entry(file="../../secret.png"), "outside its folder"),
-        (entry(file=7), "file must be a text"),
+        (entry(file=7), "file must be a string"),
         (entry(K=[[1, 0, 0], [0, 1, 0]]), "camera 1: K must be 3 x 3 numbers"),
         (entry(K=np.diag([5, -5, 1]).tolist()), "K must be upper triangular with positive"),
         (entry(cam_from_world=np.diag([2.0, 2.0, 2.0, 1.0]).tolist()), "the rotation is scaled by 2;"),
@@ -74,7 +74,7 @@ def test_plain_cameras_that_make_no_sense_are_refused(scene, tmp_path, change, m
 def test_a_list_of_other_cameras_is_left_to_others(scene, tmp_path):
     write_plain_cameras(scene, tmp_path)
     (tmp_path / "cameras.json").write_text(json.dumps([{"id": 0, "img_name": "v0"}]))
-    with pytest.raises(DataError, match="holds nothing that can be read"):
+    with pytest.raises(DataError, match="holds no known format"):
         data.open(tmp_path)
 
 
@@ -98,13 +98,13 @@ def rewritten(scene, line, text):
 @pytest.mark.parametrize(
     ("line", "text", "match"),
     [
-        (3, "0.1 0 0", "has radial distortion, whose model the format does not state"),
+        (3, "0.1 0 0", "has radial distortion, whose model the format does not define"),
         (3, "", "expected 26 numbers .* got 23"),
         (0, "-5 0 1", "K must be upper triangular"),
-        (4, "2 0 0", "the rotation is none"),
+        (4, "2 0 0", "not a rotation"),
         (7, "1 nan 2", "finite"),
         (7, "1 1e13 2", "beyond 1e12"),
-        (8, "3072 2048", "of 3072 x 2048 pixels and '0001.png' has 59 x 45"),
+        (8, "3072 2048", "has 3072 x 2048 pixels and '0001.png' has 59 x 45"),
         (8, "59.5 45", "K of another resolution"),
         (8, "59 x", "expected numbers"),
     ],
@@ -124,7 +124,7 @@ def test_strecha_folders_are_told_apart(scene, tmp_path):
     with pytest.raises(DataError, match="in one folder; found a, b"):
         data.open(tmp_path)
     (tmp_path / "a" / "0001.png").unlink()
-    with pytest.raises(DataError, match=r"finds no image '0001\.png' beside it"):
+    with pytest.raises(DataError, match=r"has no image '0001\.png' beside it"):
         data.open(tmp_path / "a")
     Image.new("RGB", (3, 3)).save(tmp_path / "a" / "0001.png")
     with pytest.raises(DataError, match="K of another resolution"):

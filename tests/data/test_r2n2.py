@@ -97,9 +97,9 @@ GOOD = "30 20 0 0.8 25\n"
         ("a b c d e\n" * 5, "expected numbers"),
         (GOOD * 4 + "nan 20 0 0.8 25\n", "finite"),
         (GOOD * 4 + "30 20 1e999 0.8 25\n", "finite"),
-        (GOOD * 4 + "30 20 0 0 25\n", "a distance that is none"),
-        (GOOD * 4 + "30 20 0 -1 25\n", "a distance that is none"),
-        (GOOD * 4 + "30 20 0 1e300 25\n", "a distance that is none"),
+        (GOOD * 4 + "30 20 0 0 25\n", "an invalid distance"),
+        (GOOD * 4 + "30 20 0 -1 25\n", "an invalid distance"),
+        (GOOD * 4 + "30 20 0 1e300 25\n", "an invalid distance"),
         (GOOD * 4 + "1e300 20 0 1 25\n", "an angle beyond"),
         (GOOD * 4 + "9" * 5000 + " 20 0 1 25\n", "number too long"),
         (GOOD * 6, "must name 6 different images"),
@@ -136,7 +136,7 @@ def test_links_are_refused(folder, tmp_path):
     (folder / "model.binvox").unlink()
     secret.rename(folder / "model.binvox")
     (folder / "model.binvox").write_text("#binvox 1\n")
-    refused(folder, "no header", "model.binvox")
+    refused(folder, "no binvox header", "model.binvox")
 
 
 def test_damaged_files_are_refused_or_read(folder):

@@ -128,15 +128,15 @@ def test_what_is_no_scene_is_told_by_what_is_there(scene, tmp_path):
     refused(tmp_path / "empty", "is empty")
     (tmp_path / "images").mkdir()
     Image.fromarray(scene.images[0]).save(tmp_path / "images" / "a.png")
-    refused(tmp_path / "images", "holds images and no file of cameras; cameras are read from a Middlebury")
-    refused(tmp_path / "images" / "a.png", "is an image; name the folder of its cameras")
+    refused(tmp_path / "images", "holds images but no file of cameras; cameras are read from a Middlebury")
+    refused(tmp_path / "images" / "a.png", "is an image; pass the folder of its cameras")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").write_text("nothing")
-    refused(tmp_path / "other", "holds nothing that can be read; cameras are read from")
+    refused(tmp_path / "other", "holds no known format; cameras are read from")
     chair = tmp_path / "tree" / "renders" / "03001627" / "chair"
     chair.mkdir(parents=True)
     (chair / "camera_0.mat").write_bytes(b"")
-    refused(tmp_path / "tree", "is a tree of many objects; name one of them, such as .*chair, or convert")
+    refused(tmp_path / "tree", "is a tree of many objects; pass one of them, such as .*chair, or convert")
 
 
 def test_a_scene_is_shown_in_a_line(scene, tmp_path):

@@ -99,7 +99,7 @@ def test_a_lost_frame_is_left_out(tmp_path, number):
     (folder / "poses.txt").write_text("\n".join(rows))
     assert data.open(folder).names == ("00000.png", "00002.png", "00003.png", "00004.png")
     (folder / "poses.txt").write_text("\n".join([rows[1]] * 5))
-    with pytest.raises(DataError, match="leaves no frame"):
+    with pytest.raises(DataError, match="has no usable frame"):
         data.open(folder)
 
 

@@ -118,10 +118,10 @@ def test_cameras_alone_stand_beside_their_images(scene, tmp_path):
     source = data.open(write_transforms(scene, tmp_path))
     file = data.write_cameras_json(source, tmp_path / "alone.json")
     check(data.open(file), source)
-    with pytest.raises(OptionError, match="must lie below the folder of the file"):
+    with pytest.raises(OptionError, match="must be below the folder of the file"):
         data.write_cameras_json(source, tmp_path / "elsewhere" / "alone.json")
     bent = data.open(write_transforms(scene, tmp_path / "bent", lambda values: values.update(k1=-0.1)))
-    with pytest.raises(OptionError, match="path must be a folder for images taken through a lens"):
+    with pytest.raises(OptionError, match="path must be a folder if images have distortion"):
         data.write_cameras_json(bent, tmp_path / "bent" / "alone.json")
 
 
@@ -132,7 +132,7 @@ def test_skew_is_refused(scene, tmp_path, form):
 
     source = data.open(write_plain_cameras(scene, tmp_path / "source", change))
     with pytest.raises(
-        OptionError, match=r"cameras must have no skew, which .* cannot hold; 'images/v1\.png' has 0\.75"
+        OptionError, match=r"cameras must have no skew, which .* does not support; 'images/v1\.png' has 0\.75"
     ):
         WRITERS[form](source, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -146,7 +146,7 @@ def test_what_is_there_is_not_touched(scene, tmp_path, form):
     out.mkdir()
     (out / "mine").write_text("kept")
     for path in (out, out / "mine"):
-        with pytest.raises(DataError, match="is there already and not an empty folder") as caught:
+        with pytest.raises(DataError, match="exists and is not an empty folder") as caught:
             WRITERS[form](source, path)
         assert caught.value.path == path
     assert (out / "mine").read_text() == "kept"
@@ -180,7 +180,7 @@ def test_two_images_of_one_name_are_refused(scene, tmp_path):
     source = data.open(write_colmap(scene, tmp_path / "source", form="text"))
     names = ("a b.png", "a_b.png", *source.names[2:])
     source = data.PosedImages(names, source.paths, source.cameras, None, "colmap")
-    with pytest.raises(DataError, match=r"two images that would be called 'a_b\.png'"):
+    with pytest.raises(DataError, match=r"two images that would be named 'a_b\.png'"):
         data.write_colmap(source, tmp_path / "out")
     assert len(data.open(data.write_transforms(source, tmp_path / "out"))) == 5
 

@@ -120,7 +120,7 @@ def test_depth_of_other_sizes_is_taken_at_its_nearest_pixels(scene, tmp_path, si
 
 @pytest.mark.parametrize("size", [(20, 15), (45, 57), (1, 59), (43, 59)])
 def test_depth_of_another_shape_than_its_image_is_refused(scene, tmp_path, size):
-    with pytest.raises(DataError, match=r"depth\.png.*not of the shape of its image, 59 x 45"):
+    with pytest.raises(DataError, match=r"depth\.png.*59 x 45: another shape"):
         write_depth(scene, tmp_path, np.ones(size, np.uint16)).load_depth(1)
 
 
@@ -183,7 +183,9 @@ def test_a_folder_of_several_says_so_and_a_file_decides(scene, tmp_path):
     (tmp_path / "transforms.json").rename(tmp_path / "transforms_train.json")
     assert len(data.open(tmp_path)) == 5
     (tmp_path / "transforms_test.json").write_bytes((tmp_path / "transforms_train.json").read_bytes())
-    with pytest.raises(DataError, match=r"found transforms_test\.json, transforms_train\.json: name the one meant"):
+    with pytest.raises(
+        DataError, match=r"found transforms_test\.json, transforms_train\.json: pass the path of one file"
+    ):
         data.open(tmp_path)
     assert len(data.open(tmp_path / "transforms_test.json")) == 5
 
@@ -201,22 +203,22 @@ def scaled(pose):
     [
         (lambda values: matrix(values, scaled), r"frame 1: the rotation is scaled by 2\.5; divide"),
         (lambda values: matrix(values, lambda m: m * [[1, -1, 1, 1]]), "frame 1: the rotation is mirrored"),
-        (lambda values: matrix(values, lambda m: m + [[0.1, 0, 0, 0]] * 4), "last row|the rotation is none"),
+        (lambda values: matrix(values, lambda m: m + [[0.1, 0, 0, 0]] * 4), "last row|not a rotation"),
         (lambda values: matrix(values, lambda m: m.T), "transform_matrix must have the last row 0 0 0 1"),
         (lambda values: matrix(values, lambda m: m[:2]), "transform_matrix must be 4 x 4 numbers"),
-        (lambda values: values["frames"][1].update(w=128, h=96), "of 128 x 96 pixels .*: K of another resolution"),
+        (lambda values: values["frames"][1].update(w=128, h=96), "has 128 x 96 pixels .*: K of another resolution"),
         (lambda values: values["frames"][1].update(w=59.5), "w must be a whole number"),
         (lambda values: [frame.pop(key) for frame in values["frames"] for key in ("fl_x", "fl_y")], "no focal length"),
         (lambda values: values["frames"][1].update(fl_x=-5), "focal lengths must be positive"),
         (lambda values: values["frames"][1].update(fl_x=True), "fl_x must be a number"),
         (lambda values: values.update(camera_angle_x=4.0) or values["frames"][0].pop("fl_x"), "between 0 and pi"),
-        (lambda values: values.update(camera_model="EQUIRECTANGULAR"), "'EQUIRECTANGULAR' is not one"),
-        (lambda values: values.update(k4=0.1), "k4 has no agreed meaning"),
+        (lambda values: values.update(camera_model="EQUIRECTANGULAR"), "'EQUIRECTANGULAR' cannot be undistorted"),
+        (lambda values: values.update(k4=0.1), "k4 has no defined meaning"),
         (lambda values: values.update(k1=-9.0), "the distortion"),
-        (lambda values: values.update(ftheta_p0=1.0), "ftheta_p0 describes a camera"),
+        (lambda values: values.update(ftheta_p0=1.0), "ftheta_p0 is of a camera"),
         (lambda values: values.update(frames=[]), "frames must be a list of 1 to"),
-        (lambda values: values["frames"].append(values["frames"][0]), "names an image twice"),
-        (lambda values: values["frames"][2].update(file_path="images/nobody"), "no such image, nor one with"),
+        (lambda values: values["frames"].append(values["frames"][0]), "uses an image name twice"),
+        (lambda values: values["frames"][2].update(file_path="images/nobody"), "no such image, also not with"),
         (lambda values: values["frames"][2].update(depth_file_path="../../d.png"), "outside its folder"),
     ],
 )

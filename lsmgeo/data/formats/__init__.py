@@ -1,1 +1,1 @@
-"""One file a format: what it holds is read, checked and given as one typed scene."""
+"""Readers, one file for each format: all return one typed scene; `detection.FORMATS` lists them."""

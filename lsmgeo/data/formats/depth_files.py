@@ -1,4 +1,4 @@
-"""Depth that comes beside an image, as camera z in world units, and portable float maps."""
+"""Depth files of images, read as camera z in world units, and portable float maps."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ HEADER = re.compile(rb"(P[fF])\s+(\d{1,9})\s+(\d{1,9})\s+(\S{1,%d})[ \t]*\r?\n" 
 
 
 class DepthFile(ABC):
-    """Something that reads the depth of one image."""
+    """The depth of one image, read when needed."""
 
     path: Path
 
     @abstractmethod
     def read(self, size: tuple[int, int]) -> np.ndarray:
-        """(H, W) float32 camera z in world units, 0 where there is none.
+        """(H, W) float32 camera z in world units, 0 for no depth.
 
         Args:
-            size: the (height, width) that it must have.
+            size: the expected (height, width).
 
         Raises:
             DataError: the file is missing, damaged, or of another size.
@@ -41,14 +41,14 @@ class DepthFile(ABC):
 
 @dataclass(frozen=True)
 class DepthPng(DepthFile):
-    """A 16-bit PNG that counts steps of depth.
+    """A 16-bit PNG of depth in steps.
 
     Attributes:
         path: the file.
         step: world units of one step.
-        empty: values that mean that there is no depth.
-        any_size: whether a map of the image's shape but with more or fewer pixels is taken, its nearest pixels
-            without any mixing: pixel i of N has the value of the map's pixel floor((i + 0.5) n / N).
+        empty: values that mean no depth.
+        any_size: whether the map may have another resolution of the same aspect ratio. It is then resized without
+            interpolation: pixel i of N has the value of pixel floor((i + 0.5) n / N) of the map.
     """
 
     path: Path
@@ -57,45 +57,43 @@ class DepthPng(DepthFile):
     any_size: bool = False
 
     def read(self, size: tuple[int, int]) -> np.ndarray:
-        """(H, W) float32 camera z, 0 where there is none."""
-        stored = self._alike(size) if self.any_size else size
+        """(H, W) float32 camera z, 0 for no depth."""
+        stored = self._stored_size(size) if self.any_size else size
         steps = decode_png(read_bytes(self.path, 4096 + 4 * MAX_PIXELS), stored, DEPTH, self.path)
         if stored != size:
-            # Whole numbers: exactly the rule, whatever the sizes.
+            # In integers, so that the rule holds exactly.
             rows, columns = ((2 * np.arange(n) + 1) * m // (2 * n) for n, m in zip(size, stored, strict=True))
             steps = steps[rows[:, None], columns]
         depth = np.where(np.isin(steps, self.empty), 0.0, steps * self.step).astype(np.float32)
         if not np.isfinite(depth).all():
-            raise DataError(self.path, f"has depth beyond what float32 holds at a step of {self.step:g}")
+            raise DataError(self.path, f"has depth beyond float32 with a step of {self.step:g}")
         return depth
 
-    def _alike(self, size: tuple[int, int]) -> tuple[int, int]:
-        """The size that the file states, if its sides have the ratio of ``size`` up to one pixel of it."""
+    def _stored_size(self, size: tuple[int, int]) -> tuple[int, int]:
+        """The size in the file, if its aspect ratio is that of ``size`` to within a pixel."""
         height, width = image_size(self.path)
         if abs(height - width * size[0] / size[1]) > 1:
-            raise DataError(
-                self.path,
-                f"is {width} x {height} pixels (width x height), not of the shape of its image, {size[1]} x {size[0]}",
-            )
+            reason = f"is {width} x {height} pixels (width x height), its image {size[1]} x {size[0]}: another shape"
+            raise DataError(self.path, reason)
         return height, width
 
 
 def read_pfm(path: Path, size: tuple[int, int]) -> np.ndarray:
     """Read a one-channel portable float map of known size.
 
-    The header is ``Pf``, width and height, and a scale whose *sign* tells the order of bytes: negative means little
-    endian. Its magnitude is not applied: Middlebury writes 1/255 or 1 there, and its disparities are pixels as they
-    stand. Rows are stored from the bottom up. (Paul Debevec's format; http://www.pauldebevec.com/Research/HDR/PFM.)
+    The header is ``Pf``, width and height, and a scale whose *sign* is the byte order: negative means little endian.
+    Its magnitude is ignored: Middlebury writes 1/255 or 1, and its disparities are stored in pixels. Rows are stored
+    from the bottom up. (Paul Debevec's format; http://www.pauldebevec.com/Research/HDR/PFM.)
 
     Args:
         path: the file.
-        size: the (height, width) that it must have.
+        size: the expected (height, width).
 
     Returns:
-        (H, W) float32, the top row first; values that are not finite stay.
+        (H, W) float32, the top row first; values that are not finite are kept.
 
     Raises:
-        DataError: the file is missing, no such map, of another size, or longer or shorter than its size needs.
+        DataError: the file is missing, not such a map, of another size, or its length does not match its size.
     """
     height, width = size
     content = read_bytes(path, MAX_HEADER_BYTES + 4 * height * width)
@@ -112,7 +110,7 @@ def read_pfm(path: Path, size: tuple[int, int]) -> np.ndarray:
     except ValueError:
         scale = np.nan
     if not (np.isfinite(scale) and scale != 0):
-        raise DataError(path, "has a scale that is no number, or zero")
+        raise DataError(path, "has a scale that is zero or not a number")
     if len(content) != header.end() + 4 * height * width:
         raise DataError(path, f"holds more or less data than {width} x {height} pixels need")
     values = np.frombuffer(content, "<f4" if scale < 0 else ">f4", offset=header.end())

@@ -1,10 +1,10 @@
-"""Which reader a file or a folder needs, told from what it holds."""
+"""Detecting the format of a file or folder; `FORMATS` is the one table of formats."""
 
 from __future__ import annotations
 
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 from lsmgeo.data.formats.format_binvox import is_binvox, read_binvox
 from lsmgeo.data.formats.format_cameras_json import is_cameras_json, read_cameras_json
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 __all__ = ["FORMATS", "Format", "detect", "open_scene"]
 
 
-MOST_LOOKED_AT = 1000
-# What lies in an object of the LSM release, and in one of 3D-R2N2's, below the folder of many.
+MOST_LISTED = 1000
+# A file of an object, below a folder of many objects of the LSM release or of 3D-R2N2.
 TREES = (
     "renders/*/*/camera_0.mat",
     "*/*/camera_0.mat",
@@ -40,15 +40,15 @@ TREES = (
 
 
 class Format(NamedTuple):
-    """A format that can be told from a path.
+    """A format, its detection and its reader.
 
     Attributes:
-        name: what `PosedImages.source` says.
-        kind: what it holds: posed images, voxels alone, or the calibration of cameras.
-        needs: what a folder of it holds, for the message when nothing is found.
-        is_here: whether a path, file or folder, is of this format. Looks at names and, where these do not decide, at
-            the beginning of a file; never raises anything but OSError and DataError.
-        read: reads it.
+        name: the value of `PosedImages.source`.
+        kind: its content: posed images, only voxels, or a calibration of cameras.
+        needs: the files of a folder of this format, for error messages.
+        is_here: whether a path, file or folder, is of this format. Looks at names and, if these do not suffice, at the
+            beginning of a file; raises only OSError and DataError.
+        read: the reader.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Format(NamedTuple):
 
 
 def _is_only_binvox(path: Path) -> bool:
-    # 3D-R2N2 puts the voxels of an object beside its renderings.
+    # 3D-R2N2 has the voxels of an object beside its renderings.
     return is_binvox(path) and not (path.is_dir() and is_r2n2(path))
 
 
@@ -71,7 +71,7 @@ FORMATS = (
     Format("middlebury-stereo", "photographs", "calib.txt and im0.png of a pair", is_stereo_pair, read_stereo_pair),
     Format("transforms", "photographs", "a transforms.json (or transforms_*.json)", is_transforms, read_transforms),
     Format("llff", "photographs", "an LLFF poses_bounds.npy", is_llff, read_llff),
-    Format("cameras", "photographs", "a cameras.json of lsmgeo's", is_cameras_json, read_cameras_json),
+    Format("cameras", "photographs", "a cameras.json of lsmgeo", is_cameras_json, read_cameras_json),
     Format("strecha", "photographs", "Strecha's *.camera files", is_strecha, read_strecha),
     Format("opencv", "calibration", "calibration files of OpenCV's FileStorage", is_calibration, read_calibration),
     Format("lsm", "photographs", "render_*.png and camera_*.mat of the LSM release", is_lsm, read_lsm),
@@ -82,10 +82,10 @@ FORMATS = (
 
 @file_reader
 def detect(path: str | Path) -> Format:
-    """Tell the format from what a folder holds, or from a file.
+    """Detect the format of a folder, or of a file.
 
     Raises:
-        DataError: there is no such path, or it is of no known format or of several.
+        DataError: the path does not exist, or is of no known format or of several.
     """
     path = Path(path)
     if not path.is_file() and not path.is_dir():
@@ -93,50 +93,49 @@ def detect(path: str | Path) -> Format:
     found = [candidate for candidate in FORMATS if candidate.is_here(path)]
     if len(found) > 1:
         several = " and ".join(candidate.needs for candidate in found)
-        raise DataError(path, f"holds {several}; name the one file or folder that is meant")
+        raise DataError(path, f"holds {several}; pass the path of one file or folder")
     if not found:
         raise DataError(path, _why_nothing(path))
     return found[0]
 
 
 def _why_nothing(path: Path) -> str:
-    """What is said of a path in which no format is found: the likely slip first."""
+    """The reason for a path without a format, the likely mistake first."""
     images, others = [], False
-    for item in islice(path.iterdir(), MOST_LOOKED_AT) if path.is_dir() else [path]:
+    for item in islice(path.iterdir(), MOST_LISTED) if path.is_dir() else [path]:
         if item.suffix.lower() in SUFFIXES:
             images.append(item)
         others = others or item not in images
     if path.is_file() and images:
-        return "is an image; name the folder of its cameras"
+        return "is an image; pass the folder of its cameras"
     if not images and not others:
         return "is empty"
     for pattern in TREES:
         inside = next(path.glob(pattern), None) if path.is_dir() else None
         if inside is not None:
-            return f"is a tree of many objects; name one of them, such as {inside.parent}, or convert it to shards"
+            return f"is a tree of many objects; pass one of them, such as {inside.parent}, or convert it to shards"
     known = f"cameras are read from {', '.join(candidate.needs for candidate in FORMATS)}"
     if images and not others:
-        return f"holds images and no file of cameras; {known}"
-    return f"holds nothing that can be read; {known}"
+        return f"holds images but no file of cameras; {known}"
+    return f"holds no known format; {known}"
 
 
 def open_scene(path: str | Path) -> PosedImages:
-    """Open posed images; the format is told from the files that a folder holds, or from the file named.
+    """Open posed images of any format; it is detected from the files of a folder, or from the file.
 
     Convention:
-        Whatever the source's, the cameras come world-to-camera, OpenCV axes, integer pixel centres.
+        Cameras are world-to-camera, OpenCV axes, integer pixel centres, whatever the source's convention.
 
     Args:
-        path: the scene's folder; or its file of cameras, where a folder holds several.
+        path: the scene's folder; or its file of cameras, if a folder has several.
 
     Returns:
-        The images with cameras, and the points, depth and voxels that the source has.
+        The images with cameras, and the points, depth and voxels of the source.
 
     Raises:
-        DataError: there is no such path, it is of no known format or of several, or its reader refuses it.
+        DataError: the path does not exist, is of no known format or of several, or cannot be read.
     """
     found = detect(path)
     if found.kind != "photographs":
-        raise DataError(path, f"holds {found.needs}, no posed images")
-    scene: PosedImages = found.read(Path(path))
-    return scene
+        raise DataError(path, f"holds {found.needs}, but no posed images")
+    return cast("PosedImages", found.read(Path(path)))

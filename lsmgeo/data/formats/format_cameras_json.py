@@ -1,4 +1,4 @@
-"""Cameras in a plain JSON file of our own: nothing to guess, nothing to convert."""
+"""The plain JSON format of lsmgeo, whose conventions are those of the library."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MOST_CAMERAS = 100_000
 
 
 def is_cameras_json(path: Path) -> bool:
-    """Whether a JSON file, or the ``cameras.json`` of a folder, holds cameras as here."""
+    """Whether a JSON file, or the ``cameras.json`` of a folder, is of this format."""
     file = path / NAME if path.is_dir() else path
     if file.suffix.lower() != ".json" or not file.is_file():
         return False
@@ -64,23 +64,23 @@ def read_cameras_json(path: str | Path) -> PosedImages:
             ],
         }
 
-    A file without ``format`` is taken for one of version 1, ``name`` for ``file``, and ``R`` (3 x 3) with ``t`` (3) for
-    ``cam_from_world``. ``depth`` may be left out: it is a 16-bit PNG of the image's size that counts steps of
-    camera z, ``depth_step`` world units each, 0 where there is none.
+    ``format`` and ``version`` are optional; ``name`` may replace ``file``, and ``R`` (3 x 3) with ``t`` (3)
+    ``cam_from_world``. The optional ``depth`` is a 16-bit PNG of the image's size: camera z in steps of ``depth_step``
+    world units, 0 for no depth.
 
     Convention:
-        World-to-camera, OpenCV axes; K may have skew. ``pixel_center`` is "integer" (also where it is left out) or
-        "half", where the first pixel is centred at (0.5, 0.5).
+        World-to-camera, OpenCV axes; K may have skew. ``pixel_center`` is "integer" (the default) or "half": the first
+        pixel is centred at (0.5, 0.5).
 
     Args:
         path: the file, or a folder with ``cameras.json``.
 
     Returns:
-        The images with their cameras and depth, cut out where any of them has alpha; no sparse points.
+        The images with their cameras and depth, cut out if any of them has alpha; no sparse points.
 
     Raises:
         DataError: a file is missing, damaged or too large, names a file outside its folder, is of another version, or
-            states a camera that makes no sense or is of another size than its image.
+            states a camera that is invalid or of another size than its image.
     """
     path = Path(path)
     file = path / NAME if path.is_dir() else path
@@ -88,7 +88,7 @@ def read_cameras_json(path: str | Path) -> PosedImages:
     stated = (values.get("format", FORMAT), values.get("version", VERSION))
     if stated != (FORMAT, VERSION) or isinstance(stated[1], bool):
         reason = f"format {describe(stated[0])}, version {describe(stated[1])}"
-        raise DataError(file, f"is of {reason}; expected {FORMAT!r}, version {VERSION}")
+        raise DataError(file, f"has {reason}; expected {FORMAT!r}, version {VERSION}")
     center = values.get("pixel_center", "integer")
     if center not in PIXEL_CENTERS:
         raise DataError(file, f"pixel_center must be one of {', '.join(PIXEL_CENTERS)}; got {describe(center)}")
@@ -141,12 +141,12 @@ def _pose(entry: dict[str, Any], file: Path, where: str) -> np.ndarray:
 
 
 def camera_entry(camera: CameraTensors) -> dict[str, Any]:
-    """What a file says of one camera, leading shape (); nothing is rounded."""
+    """The JSON object of one camera, leading shape (); nothing is rounded."""
     K, E = (part.double().tolist() for part in camera[:2])
     return {"width": int(camera.width), "height": int(camera.height), "K": K, "cam_from_world": E}
 
 
 def encode_cameras(entries: Sequence[Mapping[str, Any]]) -> bytes:
-    """The content of a file of cameras, whose pixel centres are integer."""
+    """The content of a file of cameras with integer pixel centres."""
     values = {"format": FORMAT, "version": VERSION, "pixel_center": "integer", "cameras": entries}
     return json.dumps(values, indent=1, allow_nan=False).encode()

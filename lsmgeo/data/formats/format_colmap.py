@@ -1,6 +1,6 @@
-"""COLMAP reconstructions, text or binary: cameras, poses, and sparse points with who observes them.
+"""COLMAP reconstructions, text or binary: cameras, poses, and sparse points with their observations.
 
-Binary files are little-endian, and every count is compared with the bytes left before it is used.
+Binary files are little-endian; every count is compared with the remaining bytes before it is used.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ __all__ = ["is_colmap", "read_colmap"]
 MAX_CAMERA_BYTES = 1 << 24
 MAX_MODEL_BYTES = 1 << 31
 
-# Binary id -> (name, number of parameters), as COLMAP numbers them; no number for what OpenCV does not have.
+# Binary id -> (name, number of parameters), by COLMAP's numbers; None for models that OpenCV does not have.
 CAMERA_MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -63,7 +63,7 @@ TRACK_ELEMENT = np.dtype([("image", "<u4"), ("observation", "<u4")])
 
 
 def model_folder(path: Path) -> tuple[Path, str] | None:
-    """Where a COLMAP model lies in or below ``path``, and its form ("bin" or "txt"); None where there is none."""
+    """The folder of a COLMAP model in or below ``path``, and its form ("bin" or "txt"); None if there is none."""
     for folder in (path, path / "sparse", path / "sparse" / "0", path / "0"):
         for form in ("bin", "txt"):
             if (folder / f"cameras.{form}").is_file() and (folder / f"images.{form}").is_file():
@@ -78,28 +78,27 @@ def is_colmap(path: Path) -> bool:
 
 @file_reader
 def read_colmap(path: str | Path, images: str | Path | None = None) -> PosedImages:
-    """Read a COLMAP model; images with distortion are straightened.
+    """Read a COLMAP model; distortion is removed.
 
-    The model (``cameras``, ``images`` and, where it exists, ``points3D``, binary or text) is looked for in the folder,
-    in ``sparse``, ``sparse/0`` and ``0``; the images in ``images`` in it or in up to three folders above, else in
-    the folder itself. Images are ordered by name. Its files of rigs and frames repeat the images' poses and
-    are not read.
+    The model (``cameras``, ``images`` and, if it exists, ``points3D``, binary or text) is searched in the folder, in
+    ``sparse``, ``sparse/0`` and ``0``; the images in ``images`` in it or in up to three folders above, else in the
+    folder itself. Images are ordered by name. Files of rigs and frames repeat the poses of the images and are not read.
 
     Convention:
-        COLMAP's poses are world-to-camera with OpenCV axes, as ours. Its pixel centres are half-integer: principal
-        points and observations lose 0.5. The models that OpenCV has become a `Lens`, and observations move to where
-        the straightened image shows them; one that it cannot show is left out.
+        COLMAP's poses are world-to-camera with OpenCV axes, as in lsmgeo. Its pixel centres are half-integer: 0.5 is
+        subtracted from principal points and observations. Camera models of OpenCV become a `Lens`, and observations
+        are undistorted; those outside of the undistorted image are left out.
 
     Args:
         path: the scene's folder or the model's.
-        images: folder of the images, where it is elsewhere.
+        images: folder of the images, if it is elsewhere.
 
     Returns:
         The images with cameras and sparse points.
 
     Raises:
-        DataError: no model, a damaged or inconsistent one, a camera model that OpenCV lacks, or a name that leads
-            outside the folder of images.
+        DataError: no model, a damaged or inconsistent one, a camera model that OpenCV does not have, or a name that
+            leads outside the folder of images.
     """
     path = Path(path)
     found = model_folder(path)
@@ -142,7 +141,7 @@ def read_colmap(path: str | Path, images: str | Path | None = None) -> PosedImag
 
 
 def _image_folder(path: Path, model: Path) -> Path:
-    # The third is where nerfstudio keeps them, whose models are in colmap/sparse/0.
+    # The third parent is for nerfstudio, whose models are in colmap/sparse/0.
     for folder in (path, model, *model.absolute().parents[:3]):
         if (folder / "images").is_dir():
             return folder / "images"
@@ -176,7 +175,7 @@ def _sparse_points(
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """One camera as COLMAP states it: f cx cy or fx fy cx cy with half-integer pixel centres, then its distortion."""
+    """A camera of COLMAP: f cx cy or fx fy cx cy with half-integer pixel centres, then distortion."""
 
     model: str
     width: int
@@ -186,34 +185,34 @@ class ColmapCamera:
     @property
     def focal_lengths(self) -> tuple[float, float]:
         """Along x and y."""
-        return self.parameters[0], self.parameters[self._shared]
+        return self.parameters[0], self.parameters[self._fy_index]
 
     @property
-    def _shared(self) -> int:
-        """1 where x and y have focal lengths of their own, 0 where they share one."""
+    def _fy_index(self) -> int:
+        """The index of fy: 0 if x and y share one focal length, else 1."""
         return 0 if self.model.startswith(("SIMPLE_", "RADIAL")) else 1
 
     def intrinsics(self) -> np.ndarray:
-        """K with COLMAP's own half-integer pixel centres, (3, 3)."""
-        (fx, fy), (cx, cy) = self.focal_lengths, self.parameters[self._shared + 1 : self._shared + 3]
+        """K (3, 3) with half-integer pixel centres."""
+        (fx, fy), (cx, cy) = self.focal_lengths, self.parameters[self._fy_index + 1 : self._fy_index + 3]
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
     def lens(self) -> Lens | None:
-        """What the camera's distortion is to OpenCV; None where there is none."""
-        coefficients = self.parameters[self._shared + 3 :]
+        """The camera with distortion as in OpenCV; None without distortion."""
+        coefficients = self.parameters[self._fy_index + 3 :]
         fisheye = self.model.endswith("FISHEYE")
         if not fisheye and not any(coefficients):
             return None
         K = self.intrinsics()
         K[:2, 2] -= 0.5
-        # COLMAP's order is OpenCV's, and what its shorter models leave out is zero.
+        # COLMAP's order is that of OpenCV, and the parameters that shorter models omit are zero.
         whole = coefficients + (0.0,) * (4 - len(coefficients))
         return Lens("fisheye" if fisheye else "perspective", K, whole, self.height, self.width)
 
 
 @dataclass(frozen=True, eq=False)
 class ColmapImage:
-    """One image as COLMAP states it; a point id of -1 belongs to no point."""
+    """An image of COLMAP; a point id of -1 means no point."""
 
     image_id: int
     camera_id: int
@@ -233,7 +232,7 @@ class ColmapModel(NamedTuple):
 
 
 def _read_model(folder: Path, form: str) -> ColmapModel:
-    """Read the three files in one of the two forms, and check what both forms may get wrong."""
+    """Read the three files of a form, with the checks that both forms share."""
     read_cameras, read_images, read_points = READERS[form]
     path = folder / f"cameras.{form}"
     cameras: dict[int, ColmapCamera] = {}
@@ -241,14 +240,14 @@ def _read_model(folder: Path, form: str) -> ColmapModel:
         if camera_id in cameras:
             raise DataError(path, f"uses camera id {camera_id} twice")
         if not (0 < camera.width <= 1 << 17 and 0 < camera.height <= 1 << 17):
-            raise DataError(path, f"camera {camera_id} has an impossible size {camera.width} x {camera.height}")
+            raise DataError(path, f"camera {camera_id} has an invalid size {camera.width} x {camera.height}")
         if not (np.abs(camera.parameters) < 1e7).all() or min(camera.focal_lengths) <= 0:
             raise DataError(path, f"camera {camera_id}: parameters must be finite and focal lengths positive")
         cameras[camera_id] = camera
     path = folder / f"images.{form}"
     images = list(read_images(path))
     if len({image.image_id for image in images}) != len(images):
-        raise DataError(path, "uses an image's id twice")
+        raise DataError(path, "uses the id of an image twice")
     for image in images:
         norm = float(np.linalg.norm(image.quaternion))
         if not abs(norm - 1) < 1e-2:
@@ -262,7 +261,7 @@ def _read_model(folder: Path, form: str) -> ColmapModel:
         return ColmapModel(cameras, images, None)
     points = np.fromiter(read_points(path), POINT)
     if len(np.unique(points["id"])) != len(points):
-        raise DataError(path, "uses a point's id twice")
+        raise DataError(path, "uses the id of a point twice")
     if not (np.abs(points["position"]) < 1e12).all():
         raise DataError(path, "a point is not finite or beyond 1e12")
     return ColmapModel(cameras, images, points)
@@ -273,7 +272,7 @@ def _find_model(model: int | str, path: Path) -> tuple[str, int]:
     for number, (name, parameters) in CAMERA_MODELS.items():
         if model in (number, name):
             if parameters is None:
-                reason = f"camera model {name} is none of OpenCV's; undistort first (colmap image_undistorter)"
+                reason = f"camera model {name} does not exist in OpenCV; undistort first (colmap image_undistorter)"
                 raise DataError(path, reason)
             return name, parameters
     known = ", ".join(name for name, parameters in CAMERA_MODELS.values() if parameters is not None)
@@ -281,7 +280,7 @@ def _find_model(model: int | str, path: Path) -> tuple[str, int]:
 
 
 class _Cursor:
-    """A position in a file's bytes that refuses to run past their end."""
+    """A position in the bytes of a file, checked against their end."""
 
     def __init__(self, path: Path, limit: int):
         self.path = path
@@ -297,14 +296,14 @@ class _Cursor:
         return struct.unpack_from(layout, self.content, self.offset - size)
 
     def count(self, least: int) -> int:
-        """A count of records of at least ``least`` bytes each, refused where the file is too short for them."""
+        """A count of records of at least ``least`` bytes each; an error if the file is too short for them."""
         (number,) = self.take("<Q")
         if number * least > len(self.content) - self.offset:
             raise DataError(self.path, f"announces {number} records at byte {self.offset - 8}, more than it can hold")
         return int(number)
 
     def array(self, dtype: np.dtype) -> np.ndarray:
-        """The items that come after their count."""
+        """Items after their count."""
         values = np.frombuffer(self.content, dtype, self.count(dtype.itemsize), self.offset)
         self.offset += values.nbytes
         return values
@@ -313,7 +312,7 @@ class _Cursor:
         """A zero-terminated UTF-8 name."""
         end = self.content.find(b"\0", self.offset, self.offset + 513)
         if end < 0:
-            raise DataError(self.path, f"holds a name without end at byte {self.offset}")
+            raise DataError(self.path, f"holds an unterminated name at byte {self.offset}")
         try:
             name = self.content[self.offset : end].decode("utf-8")
         except UnicodeDecodeError as error:
@@ -322,7 +321,7 @@ class _Cursor:
         return name
 
     def records(self, least: int) -> Iterator[int]:
-        """Count as many records as the file announces, and refuse what comes after the last."""
+        """Count the records that the file announces; bytes after the last one are an error."""
         yield from range(self.count(least))
         if self.offset != len(self.content):
             raise DataError(self.path, f"holds {len(self.content) - self.offset} bytes after its last record")
@@ -350,7 +349,7 @@ def _binary_points(path: Path) -> Iterator[tuple[int, tuple[float, ...], tuple[i
     cursor = _Cursor(path, MAX_MODEL_BYTES)
     for _ in cursor.records(43 + 8):
         point_id, *values, _ = cursor.take("<q3d3Bd")
-        # The track repeats what the images' own observations say; it is stepped over, here and in the text.
+        # The track repeats the observations of the images; it is skipped, here and in text files.
         cursor.array(TRACK_ELEMENT)
         yield point_id, tuple(values[:3]), tuple(values[3:])
 
@@ -376,24 +375,24 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
 
 def _text_images(path: Path) -> Iterator[ColmapImage]:
     lines = _numbered_lines(path, MAX_TEXT_BYTES)
-    # An image takes two lines, and the second is empty where it observes nothing: only blank lines before the
-    # first record and after the last may be dropped.
+    # An image takes two lines, the second empty if it observes nothing: only blank lines before the first record and
+    # after the last may be dropped.
     while lines and not lines[0][1].strip():
         lines.pop(0)
     while lines and not lines[-1][1].strip():
         lines.pop()
     if len(lines) % 2:
         lines.append((lines[-1][0], ""))
-    for (where, line), (where_seen, seen_line) in zip(lines[0::2], lines[1::2], strict=True):
-        tokens, seen = line.split(maxsplit=9), seen_line.split()
+    for (where, line), (where_points, points_line) in zip(lines[0::2], lines[1::2], strict=True):
+        tokens, seen = line.split(maxsplit=9), points_line.split()
         if len(tokens) != 10:
             raise DataError(path, f"{where}: expected id, quaternion, translation, camera id and name")
         if len(seen) % 3:
-            raise DataError(path, f"{where_seen}: observations must come as x, y, point id")
+            raise DataError(path, f"{where_points}: observations must be x, y, point id")
         image_id, camera_id = parse_ints([tokens[0], tokens[8]], path, where)
         pose = np.array(parse_floats(tokens[1:8], path, where))
-        pixels = np.array(parse_floats([*seen[0::3], *seen[1::3]], path, where_seen)).reshape(2, -1).T
-        points = np.array(parse_ints(seen[2::3], path, where_seen), np.int64)
+        pixels = np.array(parse_floats([*seen[0::3], *seen[1::3]], path, where_points)).reshape(2, -1).T
+        points = np.array(parse_ints(seen[2::3], path, where_points), np.int64)
         yield ColmapImage(image_id, camera_id, tokens[9].strip(), pose[:4], pose[4:], pixels, points)
 
 

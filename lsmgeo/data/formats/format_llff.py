@@ -1,4 +1,4 @@
-"""LLFF's ``poses_bounds.npy``: one row an image, in the order of the images' names."""
+"""LLFF's ``poses_bounds.npy``: one row for each image, in the order of their names."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ REDUCED = ("images_2", "images_4", "images_8")
 
 
 def is_llff(path: Path) -> bool:
-    """Whether a folder holds ``poses_bounds.npy``, or a file is such an array by its shape."""
+    """Whether a folder has ``poses_bounds.npy``, or a file is such an array by its shape."""
     if path.is_dir():
         return (path / NAME).is_file()
     if path.name == NAME:
@@ -37,17 +37,16 @@ def is_llff(path: Path) -> bool:
 
 @file_reader
 def read_llff(path: str | Path) -> PosedImages:
-    """Read a scene of LLFF, which NeRF's forward-facing and mip-NeRF 360's images share.
+    """Read a scene of LLFF, the format of NeRF's forward-facing scenes and of mip-NeRF 360.
 
-    A row is a 3 x 5 matrix ``[R | centre | (height, width, focal length)]``, camera-to-world, and the nearest and
-    farthest depth, which are left out here. (Mildenhall et al., "Local Light Field Fusion", SIGGRAPH 2019.) The
-    images are those of ``images``, else of ``images_2``, ``images_4`` or ``images_8``, sorted by name.
+    A row is a 3 x 5 matrix ``[R | centre | (height, width, focal length)]``, camera-to-world, then the nearest and
+    farthest depth, which are not used here. (Mildenhall et al., "Local Light Field Fusion", SIGGRAPH 2019.) The
+    images are in ``images``, else in ``images_2``, ``images_4`` or ``images_8``, sorted by name.
 
     Convention:
         The columns of R are the camera's down, right and back; they become right, down, forward, and the pose
-        world-to-camera. The principal point is the image's middle, half-integer: ((width - 1) / 2,
-        (height - 1) / 2) here. Where an image has another size than its row, K follows the image by
-        the rule for resizing, ``f' = f w' / w``.
+        world-to-camera. The principal point is the centre of the image, ((width - 1) / 2, (height - 1) / 2) in integer
+        pixel centres. If an image has another size than its row, K is resized: ``f' = f w' / w``.
 
     Args:
         path: the scene's folder, or its ``poses_bounds.npy``.
@@ -56,8 +55,8 @@ def read_llff(path: str | Path) -> PosedImages:
         The images with their cameras, no sparse points.
 
     Raises:
-        DataError: a file is missing, damaged or too large, a row makes no sense, there are more or fewer images
-            than rows, or one has another shape than its row.
+        DataError: a file is missing, damaged or too large, a row is invalid, the numbers of images and rows
+            differ, or an image has another shape than its row.
     """
     path = Path(path)
     file = path / NAME if path.is_dir() else path
@@ -65,7 +64,7 @@ def read_llff(path: str | Path) -> PosedImages:
     if rows.ndim != 2 or rows.shape[1] != COLUMNS or len(rows) == 0:
         raise DataError(file, f"must hold rows of {COLUMNS} numbers; got an array of {rows.shape}")
     if not (np.abs(rows) < 1e12).all():
-        raise DataError(file, "holds a number that is not finite or beyond 1e12")
+        raise DataError(file, "holds a number that is not finite, or beyond 1e12")
     paths = _images(file)
     if len(paths) != len(rows):
         found = f"{len(paths)} images are in {paths[0].parent.name!r}" if paths else "no folder images holds an image"
@@ -88,29 +87,29 @@ def read_llff(path: str | Path) -> PosedImages:
 
 
 def _read_array(file: Path) -> np.ndarray:
-    """float64 of the shape that the file states, which is compared with its size before anything is allocated."""
+    """The array as float64; the stated shape is compared with the size of the file before anything is allocated."""
     if not file.is_file() or (size := file.stat().st_size) > MAX_BYTES:
         raise DataError(file, f"no such file, or larger than the limit of {MAX_BYTES} bytes")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             array = np.lib.format.open_memmap(file, mode="r")
-    # NumPy evaluates the header as a literal, which raises nearly everything.
+    # NumPy parses the header as a Python literal, which raises many kinds of errors.
     except Exception as error:
         raise DataError(file, f"is not a .npy array ({str(error)[:120]})") from error
     if array.dtype.newbyteorder("=") not in (np.float32, np.float64):
         raise DataError(file, f"must hold float32 or float64; got {str(array.dtype)[:80]}")
     if array.offset + array.nbytes != size:
-        raise DataError(file, f"states an array of {array.shape}, and holds more")
+        raise DataError(file, f"states an array of {array.shape}, but holds more")
     return np.array(array, np.float64)
 
 
 def _images(file: Path) -> list[Path]:
-    """The images of the first folder that there is, sorted by name."""
+    """The images of the first folder that exists, sorted by name."""
     for name in ("images", *REDUCED):
         folder = file.parent / name
         if folder.is_dir():
-            # A name with a dot in front is no image: macOS leaves such files beside each of them.
+            # macOS leaves a file with a leading dot beside each image.
             seen = (path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
             found = sorted(name for name in seen if not name.startswith("."))
             return [path_inside(file.parent, f"{name}/{image}", file) for image in found]
@@ -118,14 +117,14 @@ def _images(file: Path) -> list[Path]:
 
 
 def _intrinsics(stated: np.ndarray, size: tuple[int, int], file: Path, where: str) -> np.ndarray:
-    """K with half-integer pixel centres of an image, whatever resolution its row is of."""
+    """K of an image, half-integer pixel centres, scaled from the resolution of its row."""
     height, width, focal = (float(value) for value in stated)
     if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE and 0 < focal <= MAX_PARAMETER):
-        reason = f"{width:g} x {height:g} pixels (width x height) and a focal length of {focal:g} make no camera"
+        reason = f"{width:g} x {height:g} pixels (width x height) with a focal length of {focal:g} are not a camera"
         raise DataError(file, f"{where}: {reason}")
     down, across = size[0] / height, size[1] / width
-    # A reduced image's sides are whole numbers, so they may miss the exact ratio by a pixel, no more.
+    # The sides of a reduced image are rounded to integers, so the aspect ratio may differ by one pixel.
     if abs(size[1] - down * width) > 1 + width / height:
-        reason = f"the row is of {width:g} x {height:g} pixels and the image has {size[1]} x {size[0]}"
-        raise DataError(file, f"{where}: {reason} (width x height): another shape, so K cannot follow")
+        reason = f"the row is for {width:g} x {height:g} pixels and the image has {size[1]} x {size[0]}"
+        raise DataError(file, f"{where}: {reason} (width x height): another shape")
     return np.array([[focal * across, 0, size[1] / 2], [0, focal * down, size[0] / 2], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""The data that came with Learnt Stereo Machines: renderings, depth, cameras and voxels of ShapeNet's objects."""
+"""The release of Learnt Stereo Machines: renderings, depth, cameras and voxels of ShapeNet objects."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ __all__ = ["is_lsm", "read_lsm", "read_lsm_object", "read_mat_files"]
 
 RENDER = re.compile(r"render_(0|[1-9][0-9]{0,4})\.png")
 RESOLUTIONS = (32, 64)
-# A step of depth in world units; the largest value means that nothing is there.
+# A step of depth in world units; the largest value means no depth.
 DEPTH_STEP = 10 / 65535
 NO_DEPTH = 65535
 # 128^3 bytes uncompressed fit.
 MAX_MAT_BYTES = 1 << 22
-# Of address space; the libraries take 200 MiB of it.
+# Address space, 200 MiB of it for the libraries.
 MEMORY = 1 << 29
 SECONDS = 60.0
 
@@ -44,22 +44,22 @@ Arrays = dict[str, np.ndarray]
 
 
 def is_lsm(path: Path) -> bool:
-    """Whether a folder holds the renderings of one object."""
+    """Whether a folder has the renderings of one object."""
     renders, cameras = (any(True for _ in path.glob(pattern)) for pattern in ("render_*.png", "camera_*.mat"))
     return renders and cameras
 
 
 @file_reader
 def read_lsm(path: str | Path, *, voxels: int = 32) -> PosedImages:
-    """Read one object of the LSM release: ``renders/SYNSET/MODEL``, its voxels beside ``renders``.
+    """Read one object of the LSM release: ``renders/SYNSET/MODEL``, with its voxels beside ``renders``.
 
     A view is ``render_i.png``, ``depth_i.png`` and ``camera_i.mat``; voxels are in
     ``voxels/modelVoxels32/SYNSET/MODEL.mat``, or 64. (Kar, Haene, Malik, "Learning a multi-view stereo machine",
     NeurIPS 2017, and the loaders of its code.)
 
     Convention:
-        The source's ``extrinsic`` is world-to-camera with OpenCV axes; its pixel centres are half-integers, so half a
-        pixel is taken off. Depth is camera z in steps of 10/65535, the largest of them empty. Voxels fill
+        The source's ``extrinsic`` is world-to-camera with OpenCV axes. Its pixel centres are half-integer, so 0.5 is
+        subtracted. Depth is camera z in steps of 10/65535, the largest value for no depth. Voxels fill
         [-0.5, 0.5]^3 and are stored as ``Volume[x, z, n - 1 - y]``.
 
     Args:
@@ -67,10 +67,10 @@ def read_lsm(path: str | Path, *, voxels: int = 32) -> PosedImages:
         voxels: the resolution to read, 32 or 64.
 
     Returns:
-        The views in the order of their numbers, cut out; with depth and voxels where they are there.
+        The views in the order of their numbers, cut out, with depth and voxels if there are any.
 
     Raises:
-        DataError: a file is missing, damaged, or crashes its parser, which runs in a process of its own.
+        DataError: a file is missing or damaged, or crashes its parser, which runs in an isolated process.
         OptionError: another resolution, or SciPy is missing.
     """
     check_choice("read_lsm", "voxels", str(voxels), tuple(map(str, RESOLUTIONS)))
@@ -79,11 +79,7 @@ def read_lsm(path: str | Path, *, voxels: int = 32) -> PosedImages:
 
 
 def read_lsm_object(folder: Path, resolutions: Sequence[int]) -> tuple[PosedImages, tuple[torch.Tensor, ...]]:
-    """Read one object without voxels, and its occupancy (n, n, n) of the resolutions that are there.
-
-    Raises:
-        DataError: no view, too many, or a file that is missing, damaged, or crashes its parser.
-    """
+    """Read one object without voxels, and its occupancy (n, n, n) of the given resolutions that exist."""
     try:
         views = sorted(int(match[1]) for file in folder.iterdir() if (match := RENDER.fullmatch(file.name)))
         root = folder.resolve().parents[2]
@@ -97,7 +93,7 @@ def read_lsm_object(folder: Path, resolutions: Sequence[int]) -> tuple[PosedImag
             raise
         raise DataError(folder, f"cannot be read ({error})") from error
     if not 1 <= len(views) <= MAX_VIEWS:
-        raise DataError(folder, f"must hold render_0.png and so on, {MAX_VIEWS} views at most; found {len(views)}")
+        raise DataError(folder, f"must hold render_0.png and so on, at most {MAX_VIEWS} views; found {len(views)}")
     cameras = [path_inside(folder, f"camera_{view}.mat", folder) for view in views]
     arrays = []
     for found in read_mat_files([*cameras, *(file for _, file in volumes)]):
@@ -110,14 +106,7 @@ def read_lsm_object(folder: Path, resolutions: Sequence[int]) -> tuple[PosedImag
 
 
 def read_mat_files(paths: Sequence[Path]) -> list[Arrays | DataError]:
-    """Read K, extrinsic and Volume from MATLAB files up to version 7.2, as far as each holds them.
-
-    Returns:
-        For each file its arrays, float64 or, beyond 64 elements, bool; or the error of one that cannot be used.
-
-    Raises:
-        OptionError: SciPy is missing.
-    """
+    """K, extrinsic and Volume of each MATLAB file (up to version 7.2), if it has them; or the error of the file."""
     if find_spec("scipy") is None:
         raise OptionError("read_mat_files: MATLAB files need SciPy; install lsmgeo[data]")
     results = parse_isolated(parse_mat, paths, limit=MAX_MAT_BYTES, memory=MEMORY, seconds=SECONDS)

@@ -1,4 +1,4 @@
-"""Middlebury's sets: multi-view scenes with one ``*_par.txt``, and stereo pairs of 2014 and 2021 with disparities."""
+"""Middlebury: multi-view scenes with one ``*_par.txt``, and the stereo pairs of 2014 and 2021 with disparities."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ PARAMETERS = "*_par.txt"
 MAX_PARAMETER_BYTES = 1 << 24
 MAX_CALIBRATION_BYTES = 1 << 16
 MOST = 1e7
-# The file rounds to three decimals.
+# Files are rounded to three decimals.
 ROUNDING = 0.01
 NAME = re.compile(r"\w{1,32}")
 MATRIX = re.compile(r"\[([^;\[\]]*);([^;\[\]]*);([^;\[\]]*)\]")
-# The second is the name in version 3 of the benchmark.
+# The second name is that of version 3 of the benchmark.
 DISPARITIES = (("disp0.pfm", "disp0GT.pfm"), ("disp1.pfm", "disp1GT.pfm"))
 
 
 def is_middlebury(path: Path) -> bool:
-    """Whether a folder holds a file of parameters, or a file is one by its name."""
+    """Whether a folder has a ``*_par.txt``, or a file is one by its name."""
     return path.match(PARAMETERS) if path.is_file() else bool(plain_files(path, PARAMETERS))
 
 
@@ -46,16 +46,16 @@ def read_middlebury(path: str | Path) -> PosedImages:
     reconstruction algorithms", CVPR 2006.)
 
     Convention:
-        The source has our own convention (world-to-camera, OpenCV axes, integer pixel centres); nothing is changed.
+        World-to-camera, OpenCV axes, integer pixel centres, as in lsmgeo; nothing is converted.
 
     Args:
         path: the scene's folder, or its ``*_par.txt``.
 
     Returns:
-        The images with their cameras, no sparse points.
+        The images with their cameras; no sparse points.
 
     Raises:
-        DataError: a file is missing, damaged, too large, names a file outside the folder, or holds no camera.
+        DataError: a file is missing, damaged or too large, names a file outside the folder, or has an invalid camera.
     """
     file = one_file(Path(path), PARAMETERS)
     lines = [line.split() for line in read_text(file, MAX_PARAMETER_BYTES).splitlines() if line.strip()]
@@ -63,7 +63,7 @@ def read_middlebury(path: str | Path) -> PosedImages:
         raise DataError(file, "the first line must be the number of images")
     (count,) = parse_ints(lines[0], file, "line 1")
     if count != len(lines) - 1 or count < 1:
-        raise DataError(file, f"announces {count} images and holds {len(lines) - 1} lines of cameras")
+        raise DataError(file, f"announces {count} images but has {len(lines) - 1} lines of cameras")
 
     names, paths, sizes = [], [], []
     numbers = np.zeros((count, 21))
@@ -75,7 +75,7 @@ def read_middlebury(path: str | Path) -> PosedImages:
         check_camera(numbers[view, :9].reshape(3, 3), numbers[view, 9:18].reshape(3, 3), file, where)
         names.append(tokens[0])
         paths.append(path_inside(file.parent, tokens[0], file))
-        # The format does not state the size, so it comes from the image's own header.
+        # The format does not state sizes; they are those of the images.
         sizes.append(image_size(paths[-1]))
     K, R, t = np.split(numbers, (9, 18), -1)
     cameras = make_cameras(K.reshape(-1, 3, 3), R.reshape(-1, 3, 3), t, sizes, file)
@@ -84,13 +84,13 @@ def read_middlebury(path: str | Path) -> PosedImages:
 
 @dataclass(frozen=True)
 class Disparity(DepthFile):
-    """Depth as the disparity of a rectified pair: Z = f B / (d + doffs).
+    """Depth from the disparity of a rectified pair: Z = f B / (d + doffs).
 
     Attributes:
-        path: a portable float map of disparities d in pixels, positive, infinite where unknown.
+        path: a portable float map of positive disparities d in pixels, infinite if unknown.
         focal_length: f in pixels.
         baseline: B in world units.
-        offset: doffs, cx of the right camera less that of the left, in pixels.
+        offset: doffs, cx of the right camera minus cx of the left one, in pixels.
     """
 
     path: Path
@@ -99,17 +99,17 @@ class Disparity(DepthFile):
     offset: float
 
     def read(self, size: tuple[int, int]) -> np.ndarray:
-        """(H, W) float32 camera z, 0 where the disparity is unknown or means no point before the camera."""
+        """(H, W) float32 camera z, 0 if the disparity is unknown, or of no point in front of the camera."""
         shift = read_pfm(self.path, size).astype(np.float64) + self.offset
         known = np.isfinite(shift) & (shift > 0)
         depth = self.focal_length * self.baseline / np.where(known, shift, 1.0)
-        # A disparity next to -doffs is a depth that float32 may not hold, and no measurement.
+        # A disparity close to -doffs is a depth beyond float32, and not a measurement.
         known &= depth < np.finfo(np.float32).max
         return np.where(known, depth, 0.0).astype(np.float32)
 
 
 def is_stereo_pair(path: Path) -> bool:
-    """Whether a folder, or a ``calib.txt``, is of the form that `read_stereo_pair` reads."""
+    """Whether `read_stereo_pair` can read a folder or a ``calib.txt``."""
     if path.is_file():
         return path.name == "calib.txt" and is_stereo_pair(path.parent)
     return (path / "calib.txt").is_file() and (path / "im0.png").is_file()
@@ -126,17 +126,17 @@ def read_stereo_pair(path: str | Path) -> PosedImages:
     Equation: a left pixel (x, y) with disparity d is the right pixel (x - d, y), and Z = f B / (d + doffs).
 
     Convention:
-        Integer pixel centres and OpenCV axes, as ours. The world is the left camera, and its unit that of ``baseline``:
-        millimetres in the published sets.
+        Integer pixel centres and OpenCV axes, as in lsmgeo. The world frame is the left camera, in the unit of
+        ``baseline``: millimetres in the published sets.
 
     Args:
         path: the folder, or its ``calib.txt``.
 
     Returns:
-        The left image, then the right one, with cameras and what depth there is; no sparse points.
+        The left image, then the right one, with cameras and their depth, if any; no sparse points.
 
     Raises:
-        DataError: a file is missing, damaged or too large, leads outside the folder, or the two cameras are no
+        DataError: a file is missing, damaged or too large, or leads outside the folder; or the cameras are not a
             rectified pair.
 
     Example:
@@ -153,9 +153,9 @@ def read_stereo_pair(path: str | Path) -> PosedImages:
         raise DataError(file, "baseline must be positive")
     focal_length = float(first[0, 0])
     if np.abs(first - second)[[0, 1, 1], [0, 1, 2]].max() > ROUNDING:
-        raise DataError(file, "cam0 and cam1 must share focal length and cy: this is no rectified pair")
+        raise DataError(file, "cam0 and cam1 must have the same focal length and cy: this is not a rectified pair")
     if abs(second[0, 2] - first[0, 2] - offset) > ROUNDING:
-        raise DataError(file, f"doffs is {offset:g}, but cx of cam1 less that of cam0 {second[0, 2] - first[0, 2]:g}")
+        raise DataError(file, f"doffs is {offset:g}, but cx of cam1 minus cx of cam0 is {second[0, 2] - first[0, 2]:g}")
     paths = tuple(path_inside(folder, name, file) for name in ("im0.png", "im1.png"))
     sizes = [image_size(image) for image in paths]
     if "height" in entries and "width" in entries:

@@ -1,4 +1,4 @@
-"""Calibrations as OpenCV's samples write them: lenses, rigs of two cameras, and the boards that were seen."""
+"""Calibrations in the form of OpenCV's samples: lenses, rigs of two cameras, and the images of chessboards."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ if TYPE_CHECKING:
 __all__ = ["Board", "CalibratedLens", "Calibration", "Rig", "calibration_files", "is_calibration", "read_calibration"]
 
 MOST_FILES = 64
-# A calibration with the corners of a hundred boards in it has one tenth of this.
+# Ten times a calibration with the corners of a hundred boards.
 MAX_STORAGE_BYTES = 1 << 22
-# Of address space; OpenCV and NumPy take most of it.
+# Address space, most of it for OpenCV and NumPy.
 MEMORY = 1 << 30
 SECONDS = 30.0
 BEYOND = 1e12
 MOST_COEFFICIENT = 1e6
 MOST_CORNERS = 100
 COUNTS = {"perspective": (4, 5, 8, 12, 14), "fisheye": (4,)}
-# Names are compared without underscores and capitals, in which the samples of several years differ.
+# Names are compared without underscores and in lower case: OpenCV's samples differ in both.
 MATRICES = ("cameramatrix", "intrinsicmatrix", "m", "k")
 DISTORTIONS = ("distortioncoefficients", "distcoeffs", "distcoeff", "d")
 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedLens:
-    """A lens as a calibration states it.
+    """A lens of a calibration.
 
     Attributes:
         kind: "perspective" or "fisheye", as in `Lens`.
         intrinsics: (3, 3) float64, integer pixel centres.
-        coefficients: of the distortion, as in `Lens`; zeros where none are stated.
-        size: (height, width) of its images, None where it is not stated.
+        coefficients: of the distortion, as in `Lens`; zeros if none are stated.
+        size: (height, width) of its images, None if not stated.
         views: (N, 6) poses of the board in N images, board-to-camera: rotation vector (radians), then translation
-            (units of the square's size); None where they are not stated.
-        file: what states it.
+            (units of the square's size); None if not stated.
+        file: the file that states it.
     """
 
     kind: Literal["perspective", "fisheye"]
@@ -65,7 +65,7 @@ class CalibratedLens:
 
 
 class Entries(NamedTuple):
-    """What one file states, by name without underscores and capitals."""
+    """The values of one file, by name in lower case and without underscores."""
 
     numbers: dict[str, float]
     texts: dict[str, tuple[str, ...]]
@@ -84,22 +84,22 @@ class Board(NamedTuple):
     """A chessboard."""
 
     corners: tuple[int, int]  # inner corners along a row and along a column
-    square: float | None  # side of a square, None where it is not stated
+    square: float | None  # side of a square, None if not stated
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What calibration files state.
+    """The content of calibration files.
 
     Convention:
-        All of OpenCV: x right, y down, z forward, integer pixel centres, board and first camera to camera.
+        OpenCV: x right, y down, z forward, integer pixel centres; poses are board-to-camera and first-to-second camera.
 
     Attributes:
-        lenses: by name: "first" and "second" of a rig, otherwise the name of the file, without its ending.
-        rig: how the second camera stands to the first, where that is stated.
-        board: the chessboard, where its corners are stated.
-        images: files of the board's images, one tuple a camera: two of equal length whose images were taken at
-            once, or one, or none.
+        lenses: by name: "first" and "second" of a rig, otherwise the name of the file without its suffix.
+        rig: the pose of the second camera relative to the first, if stated.
+        board: the chessboard, if its corners are stated.
+        images: files of the board's images, one tuple for each camera: two of equal length, of pairs taken at the same
+            time; or one, or none.
         source: the name of the format.
     """
 
@@ -117,41 +117,41 @@ class Calibration:
 
 
 def calibration_files(folder: Path) -> list[Path]:
-    """The files of FileStorage in a folder, sorted."""
+    """The FileStorage files of a folder, sorted."""
     return sorted(path for path in folder.iterdir() if is_storage(path))
 
 
 def is_calibration(path: Path) -> bool:
-    """Whether a file, or one in a folder, is what `read_calibration` reads."""
+    """Whether `read_calibration` can read a file, or a file of a folder."""
     return bool(calibration_files(path)) if path.is_dir() else is_storage(path)
 
 
 @file_reader
 def read_calibration(path: str | Path) -> Calibration:
-    """Read calibrations that OpenCV's FileStorage wrote as YAML, XML or JSON.
+    """Read calibrations of OpenCV's FileStorage, as YAML, XML or JSON.
 
-    Known are the names of OpenCV's samples: ``camera_matrix`` and ``distortion_coefficients`` with ``image_width``,
+    Names are those of OpenCV's samples: ``camera_matrix`` and ``distortion_coefficients`` with ``image_width``,
     ``image_height``, ``board_width``, ``board_height``, ``square_size`` and ``extrinsic_parameters``; ``M1 D1 M2 D2``,
-    ``K1 D1 K2 D2`` or ``cameraMatrix1 distCoeffs1`` and so on, with ``R T``, of a rig; ``fisheye_model``; and one list
-    of images.
+    ``K1 D1 K2 D2`` or ``cameraMatrix1 distCoeffs1`` and the like, with ``R T``, for a rig; ``fisheye_model``; and one
+    list of images.
     (https://docs.opencv.org, tutorial "Camera calibration With OpenCV" and samples calibration and stereo_calib.)
 
-    All files of a folder are taken together, as a rig's lenses, its R and T and the list of its images usually lie in
-    three; nothing may be stated twice. Images of a list that are not there are left out, with their partner. A JSON
-    file is looked at where it holds a matrix of OpenCV's.
+    All files of a folder are read together: the lenses of a rig, its R and T and the list of its images are usually in
+    three files. Nothing may be stated twice. Missing images of a list are left out, with their partner. JSON files
+    without a matrix of OpenCV are ignored.
 
     Convention:
-        OpenCV's, which is ours; nothing is changed.
+        OpenCV's, which is that of lsmgeo; nothing is converted.
 
     Args:
-        path: a file, or a folder of them.
+        path: a file, or a folder of such files.
 
     Returns:
-        Lenses, rig, board and images, as far as they are stated.
+        The lenses, rig, board and images that the files state.
 
     Raises:
-        DataError: a file is damaged or too large, crashes its parser, states what is no lens or no rotation, or names
-            an image outside its folder; two files state the same; or there is nothing to be used.
+        DataError: a file is damaged or too large, crashes its parser, states an invalid lens or rotation, or names an
+            image outside its folder; two files state the same; or there is nothing to use.
 
     Example:
         >>> from lsmgeo import data
@@ -169,31 +169,29 @@ def read_calibration(path: str | Path) -> Calibration:
             raise entries
         for name, lens in _lenses(entries, file):
             if name in lenses:
-                raise DataError(file, f"states the lens {name!r}, and so does {lenses[name].file.name}; name one file")
+                raise DataError(
+                    file, f"states the lens {name!r} as {lenses[name].file.name} does; pass the path of one file"
+                )
             lenses[name] = lens
         if (found := _rig(entries, file)) is not None:
             if rig is not None:
-                raise DataError(file, f"states R and T, and so does {rig.file.name}; name one file")
+                raise DataError(file, f"states R and T, and so does {rig.file.name}; pass the path of one file")
             rig = found
-        if (seen := _board(entries, file)) is not None:
-            if board is not None and board.corners != seen.corners:
-                raise DataError(file, f"states a board of {seen.corners} corners, another file {board.corners}")
-            board = seen
+        if (stated := _board(entries, file)) is not None:
+            if board is not None and board.corners != stated.corners:
+                raise DataError(file, f"states a board of {stated.corners} corners, another file {board.corners}")
+            board = stated
         lists += [(file, names) for names in entries.texts.values() if _are_images(names)]
     if len(lists) > 1:
-        raise DataError(lists[1][0], f"lists images, and so does {lists[0][0].name}; name one file")
+        raise DataError(lists[1][0], f"lists images, and so does {lists[0][0].name}; pass the path of one file")
     images = _images(*lists[0]) if lists else ()
     if not lenses and rig is None and not images:
-        raise DataError(path, "states no camera matrix, no R and T, and lists no image")
+        raise DataError(path, "has no camera matrix, no R and T, and no list of images")
     return Calibration(lenses, rig, board, images)
 
 
 def read_storage_files(paths: Sequence[Path]) -> list[Entries | DataError]:
-    """Read numbers, texts, lists of texts and matrices from the top of FileStorage files.
-
-    Returns:
-        For each file what it states, or the error of one that cannot be used. Matrices are float64.
-    """
+    """The top-level values of each FileStorage file, matrices as float64; or the error of an unusable file."""
     results: list[Entries | DataError] = []
     found = parse_isolated(parse_storage, paths, limit=MAX_STORAGE_BYTES, memory=MEMORY, seconds=SECONDS)
     for path, arrays in zip(paths, found, strict=True):
@@ -204,17 +202,13 @@ def read_storage_files(paths: Sequence[Path]) -> list[Entries | DataError]:
         numbers = {name: array for name, array in folded.items() if array.dtype == np.float64 and array.ndim in (0, 2)}
         wrong = [name for name, array in numbers.items() if not (np.abs(array) <= BEYOND).all()]
         if len(folded) != len(arrays):
-            reason = "states two values whose names differ in capitals or underscores alone"
-            results.append(DataError(path, reason))
+            results.append(DataError(path, "has two names that differ only in capitals or underscores"))
         elif wrong:
-            reason = f"{wrong[0][:80]!r} must hold finite numbers of at most {BEYOND:g}"
-            results.append(DataError(path, reason))
+            results.append(DataError(path, f"{wrong[0][:80]!r} must hold finite numbers of at most {BEYOND:g}"))
         else:
-            results.append(Entries(
-                {name: float(array) for name, array in numbers.items() if array.ndim == 0},
-                {name: tuple(array.ravel().tolist()) for name, array in folded.items() if array.dtype.kind == "U"},
-                {name: array for name, array in numbers.items() if array.ndim == 2},
-            ))  # fmt: skip
+            scalars = {name: float(array) for name, array in numbers.items() if array.ndim == 0}
+            texts = {name: tuple(array.ravel().tolist()) for name, array in folded.items() if array.dtype.kind == "U"}
+            results.append(Entries(scalars, texts, {name: numbers[name] for name in numbers if name not in scalars}))
     return results
 
 
@@ -228,7 +222,7 @@ def _lenses(entries: Entries, file: Path) -> Iterator[tuple[str, CalibratedLens]
             raise DataError(file, f"{name}: K must be 3 x 3; got {matrix.shape[0]} x {matrix.shape[1]}")
         check_intrinsics(matrix, file, name)
         if matrix[0, 1] != 0:
-            raise DataError(file, f"{name}: K has skew, which OpenCV's model of a lens has not")
+            raise DataError(file, f"{name}: K has skew, which OpenCV's lens model does not support")
         kind: Literal["perspective", "fisheye"] = "fisheye" if entries.numbers.get("fisheyemodel") else "perspective"
         coefficients = np.zeros(4) if distortion is None else distortion.ravel()
         if len(coefficients) not in COUNTS[kind]:
@@ -245,7 +239,7 @@ def _lenses(entries: Entries, file: Path) -> Iterator[tuple[str, CalibratedLens]
 def _one_of(matrices: dict[str, np.ndarray], names: tuple[str, ...], number: str, file: Path) -> np.ndarray | None:
     found = [name + number for name in names if name + number in matrices]
     if len(found) > 1:
-        raise DataError(file, f"states {found[0]} and {found[1]}, which mean the same")
+        raise DataError(file, f"states {found[0]} and {found[1]}, which are synonyms")
     return matrices[found[0]] if found else None
 
 
@@ -266,7 +260,7 @@ def _board(entries: Entries, file: Path) -> Board | None:
     if square is not None and square <= 0:
         raise DataError(file, f"square_size must be positive; got {square:g}")
     if min(corners) < 2:
-        raise DataError(file, f"a board has 2 corners a side at least; got {corners}")
+        raise DataError(file, f"a board must have at least 2 corners a side; got {corners}")
     return Board(corners, square)
 
 
@@ -280,7 +274,7 @@ def _rig(entries: Entries, file: Path) -> Rig | None:
         import cv2
 
         if np.abs(rotation).max() > 2 * np.pi:
-            raise DataError(file, "R is a rotation vector of more than a turn")
+            raise DataError(file, "R is a rotation vector of more than 360 degrees")
         rotation = np.asarray(cv2.Rodrigues(rotation.reshape(3, 1))[0])
     check_rotation(rotation, file, "R")
     return Rig(rotation, translation.ravel(), file)
@@ -294,7 +288,7 @@ def _images(file: Path, names: tuple[str, ...]) -> tuple[tuple[Path, ...], ...]:
     if len(set(names)) != len(names):
         raise DataError(file, "lists an image twice")
     paths = [path_inside(file.parent, name, file) for name in names]
-    # Two cameras where names apart from their digits alternate, as left01.jpg, right01.jpg, left02.jpg do.
+    # Two cameras if names without digits alternate: left01.jpg, right01.jpg, left02.jpg, ...
     kinds = [re.sub(r"\d", "", name) for name in names]
     if len(names) % 2 == 0 and set(kinds[0::2]) != set(kinds[1::2]) and len(set(kinds)) == 2:
         pairs = [pair for pair in zip(paths[0::2], paths[1::2], strict=True) if all(path.is_file() for path in pair)]

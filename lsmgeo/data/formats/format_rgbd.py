@@ -1,4 +1,4 @@
-"""Recordings of depth sensors: images with 16-bit depth, one K, and poses in one table or in files."""
+"""RGB-D recordings: images with 16-bit depth, one K, and poses in one table or in a file for each frame."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ __all__ = ["is_rgbd", "is_seven_scenes", "read_rgbd", "read_seven_scenes"]
 
 MAX_TABLE_BYTES = 1 << 26
 MAX_MATRIX_BYTES = 1 << 14
-# Metres or millimetres: no camera of a room or a city is further from the origin.
+# In metres or millimetres, farther than any camera of a room or a city.
 FARTHEST = 1e9
 MILLIMETRE = 0.001
 TABLES = ("K.txt", "poses.txt", "frame_index.txt")
 POSES = "frame-*.pose.txt"
-# A sequence has 500 or 1,000 frames; this is an hour of thirty a second.
+# A sequence has 500 or 1,000 frames; this is an hour at 30 frames a second.
 MAX_FRAMES = 108_000
 MAX_POSE_BYTES = 4096
-# What the set's authors state, for the camera of depth.
+# Of the depth camera, as the authors state.
 KINECT = (585.0, 585.0, 320.0, 240.0)
-# Zero is where other writers of this form put no depth, 65535 where the set itself does.
+# No depth: 65535 in the set itself, 0 from other writers of its form.
 NO_DEPTH = (0, 65535)
 
 
 def is_rgbd(path: Path) -> bool:
-    """Whether a folder, or a ``poses.txt``, is of the form that `read_rgbd` reads."""
+    """Whether `read_rgbd` can read a folder or a ``poses.txt``."""
     if path.is_file():
         return path.name == "poses.txt" and is_rgbd(path.parent)
     return all((path / name).is_file() for name in TABLES)
@@ -53,28 +53,28 @@ def is_rgbd(path: Path) -> bool:
 
 @file_reader
 def read_rgbd(path: str | Path) -> PosedImages:
-    """Read an RGB-D folder with one table of poses, as HoloLens recordings are kept.
+    """Read an RGB-D folder with one table of poses, the form of HoloLens recordings.
 
-    ``K.txt`` holds K (3 x 3), ``poses.txt`` 16 numbers a line, the 4 x 4 pose of one frame row by row,
-    ``frame_index.txt`` the name of that frame on the same line; ``images/`` and ``depth/`` the images of these names.
+    ``K.txt`` contains K (3 x 3), ``poses.txt`` 16 numbers a line, the 4 x 4 pose of one frame row by row,
+    ``frame_index.txt`` the name of that frame on the same line; ``images/`` and ``depth/`` the files of these names.
     (The form of HoloLens sets in DeepVideoMVS: Duzceker et al., "DeepVideoMVS: Multi-view stereo on video with
     recurrent spatio-temporal fusion", CVPR 2021.)
 
     Convention:
-        The source has camera-to-world poses, OpenCV axes, integer pixel centres, no distortion, and depth as
-        millimetres of camera z with 0 where there is none; the poses are inverted, and depth comes in metres.
+        The source has camera-to-world poses, OpenCV axes, integer pixel centres, no distortion, and depth in
+        millimetres of camera z, 0 for no depth. The poses are inverted, and depth is returned in metres.
 
-    Frames are matched by name. A frame whose image is not there is left out, and so is one whose pose holds a number
-    that is not finite, which is how trackers write that they were lost. A frame without a file of depth has none.
+    Frames are matched by name. Frames without an image are left out, and so are frames whose pose is not finite (the
+    tracker was lost). A frame without a depth file has no depth.
 
     Args:
         path: the folder, or its ``poses.txt``.
 
     Returns:
-        The images with cameras and depth, no sparse points.
+        The images with cameras and depth; no sparse points.
 
     Raises:
-        DataError: a file is missing, damaged, too large, or names a file outside the folder; or no frame is left.
+        DataError: a file is missing, damaged or too large, or names a file outside the folder; or no frame is left.
 
     Example:
         >>> from lsmgeo import data
@@ -89,7 +89,7 @@ def read_rgbd(path: str | Path) -> PosedImages:
     if len(names) != len(rows):
         raise DataError(table, f"holds {len(rows)} poses; frame_index.txt names {len(names)} frames")
     if len(set(names)) != len(names):
-        raise DataError(index, "names a frame twice")
+        raise DataError(index, "uses the name of a frame twice")
     frames = (
         (
             name,
@@ -103,7 +103,7 @@ def read_rgbd(path: str | Path) -> PosedImages:
 
 
 def _parse_pose(text: str, path: Path, where: str) -> np.ndarray | None:
-    """A 4 x 4 pose from 16 numbers; None where one of them is not finite."""
+    """A 4 x 4 pose from 16 numbers; None if one of them is not finite."""
     tokens = text.split(maxsplit=16)
     if len(tokens) != 16:
         raise DataError(path, f"{where}: expected the 16 numbers of a pose")
@@ -123,20 +123,20 @@ def _scene(
     file: Path,
     source: str,
 ) -> PosedImages:
-    """Name, image, camera-to-world pose and depth of each frame; those without image or pose are left out."""
+    """The scene of frames (name, image, camera-to-world pose, depth); those without image or pose are left out."""
     kept = [
         (name, image, pose, DepthPng(depth, MILLIMETRE, no_depth) if depth.is_file() else None)
         for name, image, pose, depth in frames
         if pose is not None and image.is_file()
     ]
     if not kept:
-        raise DataError(file, "leaves no frame: every image is missing or its pose is not finite")
+        raise DataError(file, "has no usable frame: each has no image or a pose that is not finite")
     names, paths, poses, depths = zip(*kept, strict=True)
     for name, pose in zip(names, poses, strict=True):
         check_rotation(pose[:3, :3], file, name)
     world_from_cam = np.stack(poses)
     R = world_from_cam[:, :3, :3].transpose(0, 2, 1)
-    # -R C and not the inverse: rotations are rounded in these files, and the camera's place should not be.
+    # -R C, not the inverse: rotations are rounded in these files, and the camera centre should be exact.
     t = -(R * world_from_cam[:, None, :3, 3]).sum(-1)
     cameras = make_cameras([intrinsics] * len(names), R, t, [image_size(path) for path in paths], file)
     return assemble(names, paths, cameras, source, file=file, depths=depths)
@@ -152,39 +152,39 @@ def _read_intrinsics(file: Path) -> np.ndarray:
 
 
 def is_seven_scenes(path: Path) -> bool:
-    """Whether a folder is a sequence that `read_seven_scenes` reads."""
+    """Whether `read_seven_scenes` can read a folder."""
     return path.is_dir() and next(path.glob(POSES), None) is not None
 
 
 @file_reader
 def read_seven_scenes(path: str | Path, *, intrinsics: tuple[float, float, float, float] = KINECT) -> PosedImages:
-    """Read one sequence of 7-Scenes, or of a set kept in its form.
+    """Read one sequence of 7-Scenes, or of a set of its form.
 
-    For each frame ``frame-000000.color.png``, ``.depth.png`` (16-bit millimetres, 0 and 65535 where there is none) and
+    For each frame ``frame-000000.color.png``, ``.depth.png`` (16-bit millimetres, 0 and 65535 for no depth) and
     ``.pose.txt`` (4 x 4). (Shotton et al., "Scene coordinate regression forests for camera relocalization in RGB-D
     images", CVPR 2013.)
 
     Convention:
-        The source has camera-to-world poses and OpenCV axes; the poses are inverted, and depth comes in metres.
+        The source has camera-to-world poses and OpenCV axes. The poses are inverted, and depth is returned in metres.
 
-    In the set itself colour and depth are *not registered*: they are images of two cameras side by side, with some
-    pixels between them, and only the depth camera's K is stated. Its K and poses are used for both, as is customary;
-    what is compared across the two (the depth at a pixel of colour) is off by that much near edges. The stated
-    principal point is the middle of the image, so half a pixel in it means nothing.
+    In the set itself colour and depth are *not registered*: they are images of two cameras side by side, and only K of
+    the depth camera is published. It is customary to use its K and poses for both; the depth at a pixel of the colour
+    image is then off by some pixels, which shows near edges. The published principal point is the centre of the image,
+    so half a pixel in it has no meaning.
 
-    A frame without its colour image is left out, and so is one whose pose holds a number that is not finite (lost
-    tracking). A frame without its depth image has no depth.
+    Frames without a colour image, or with a pose that is not finite (tracking lost), are left out. A frame without a
+    depth image has no depth.
 
     Args:
         path: the folder of one sequence, such as ``chess/seq-01``.
         intrinsics: fx, fy, cx, cy in pixels, integer pixel centres, of all frames.
 
     Returns:
-        The colour images with cameras and depth, in the order of their names; no sparse points.
+        The colour images with cameras and depth, ordered by name; no sparse points.
 
     Raises:
-        DataError: a file is damaged, too large, or leads outside the folder; or no frame is left.
-        OptionError: intrinsics that are no four numbers, or whose focal lengths are not positive.
+        DataError: a file is damaged or too large, or leads outside the folder; or no frame is left.
+        OptionError: intrinsics are not four numbers with positive focal lengths.
 
     Example:
         >>> from lsmgeo import data

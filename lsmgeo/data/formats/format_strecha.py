@@ -15,40 +15,40 @@ from lsmgeo.errors import DataError
 __all__ = ["is_strecha", "read_strecha"]
 
 SUFFIX = ".camera"
-# In the folder, else in the folders in it.
+# In the folder, else in its subfolders.
 PATTERNS = ("*.camera", "*/*.camera")
 MAX_CAMERA_BYTES = 1 << 16
-# Numbers of a file: K, three of radial distortion, R, the centre, width and height.
+# Numbers in a file: K, three of radial distortion, R, the camera centre, width and height.
 PARTS = (9, 3, 9, 3, 2)
 
 
 def is_strecha(path: Path) -> bool:
-    """Whether a folder holds such files, or a file is one by its name."""
+    """Whether a folder has ``.camera`` files, or a file is one by its name."""
     return bool(plain_files(path, *PATTERNS)) if path.is_dir() else path.suffix == SUFFIX
 
 
 @file_reader
 def read_strecha(path: str | Path) -> PosedImages:
-    """Read a scene in the form of Strecha's multi-view benchmark.
+    """Read a scene of the form of Strecha's multi-view benchmark.
 
-    ``0000.png.camera`` belongs to ``0000.png`` and holds K (3 lines), three numbers of radial distortion, R (3 lines),
+    ``0000.png.camera`` belongs to ``0000.png``, with K (3 lines), three numbers of radial distortion, R (3 lines),
     the camera's centre C, then width and height; the projection is ``K [R^T | -R^T C]``. (Strecha, von Hansen, Van
     Gool, Fua, Thoennessen, "On benchmarking camera calibration and multi-view stereo for high resolution imagery", CVPR
-    2008.) The images lie beside these files, in ``images`` there, or in ``images`` beside their folder; ``.P``
+    2008.) The images are beside these files, in their folder ``images``, or in ``images`` beside their folder; ``.P``
     and ``.bounding`` files are not read.
 
     Convention:
-        R is camera-to-world with OpenCV axes, and is transposed. Pixel centres are integer, as ours.
+        R is camera-to-world with OpenCV axes, and is transposed. Pixel centres are integer, as in lsmgeo.
 
     Args:
-        path: the folder of the ``.camera`` files, or the one above it; or one of these files, for all of its folder.
+        path: the folder of the ``.camera`` files, or its parent; or one of these files, for all of its folder.
 
     Returns:
         The images with their cameras, ordered by name; no sparse points.
 
     Raises:
-        DataError: a file is missing, damaged or too large, several folders hold such files, a camera has distortion,
-            makes no sense, or is of another size than its image.
+        DataError: a file is missing, damaged or too large, several folders have such files, or a camera has
+            distortion, is invalid, or is of another size than its image.
     """
     path = Path(path)
     files = plain_files(path if path.is_dir() else path.parent, *PATTERNS)
@@ -65,11 +65,11 @@ def read_strecha(path: str | Path) -> PosedImages:
         parts = np.split(np.array(numbers), np.cumsum(PARTS)[:-1])
         matrix, radial, rotation, center, (width, height) = parts
         if radial.any():
-            raise DataError(file, "has radial distortion, whose model the format does not state; undistort first")
+            raise DataError(file, "has radial distortion, whose model the format does not define; undistort first")
         intrinsics.append(matrix.reshape(3, 3))
         check_camera(intrinsics[-1], rotation.reshape(3, 3), file, "camera")
         if np.abs(center).max() > 1e12:
-            raise DataError(file, "the camera's centre lies beyond 1e12")
+            raise DataError(file, "the camera centre is beyond 1e12")
         names.append(file.name.removesuffix(SUFFIX))
         paths.append(_image(file, names[-1]))
         sizes.append(image_size(paths[-1]))
@@ -86,4 +86,4 @@ def _image(file: Path, name: str) -> Path:
             image = path_inside(root, name, file)
             if image.is_file():
                 return image
-    raise DataError(file, f"finds no image {name[:80]!r} beside it, in images, nor in ../images")
+    raise DataError(file, f"has no image {name[:80]!r} beside it, in images or in ../images")

@@ -31,23 +31,23 @@ from lsmgeo.errors import DataError
 
 __all__ = ["is_transforms", "read_transforms"]
 
-# The first of these that a folder has.
+# The first of these patterns with a match.
 NAMES = ("transforms.json", "transforms_*.json")
 MOST_FRAMES = 100_000
-# nerfstudio's depth is in millimetres where the file says nothing else.
+# nerfstudio's depth is in millimetres by default.
 DEPTH_STEP = 1e-3
 
-# What nerfstudio calls the camera, and which coefficients then count.
+# Camera models of nerfstudio, and the coefficients of each kind.
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE")
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "FISHEYE")
 COEFFICIENTS = {"perspective": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "k3", "k4")}
 WITHOUT_MEANING = {"perspective": ("k4", "k5", "k6"), "fisheye": ("p1", "p2")}
-# Cameras and axes of instant-ngp that are none of the above.
+# Other cameras and axes of instant-ngp.
 REFUSED = ("ftheta_p0", "latlong", "equirectangular", "from_na")
 
 
 def is_transforms(path: Path) -> bool:
-    """Whether a folder holds such files, or a JSON file such frames."""
+    """Whether a folder has such files, or a JSON file has frames."""
     if path.is_dir():
         return bool(plain_files(path, *NAMES))
     return path.suffix.lower() == ".json" and isinstance(sniff_json(path).get("frames"), list)
@@ -57,28 +57,28 @@ def is_transforms(path: Path) -> bool:
 def read_transforms(path: str | Path) -> PosedImages:
     """Read a ``transforms.json`` of NeRF's Blender scenes, of instant-ngp or of nerfstudio.
 
-    A frame's ``transform_matrix`` is camera-to-world, 4 x 4 or its first three rows. The camera is stated by ``fl_x``,
-    ``fl_y``, ``cx``, ``cy``, ``w``, ``h`` or by ``camera_angle_x`` (radians, across the image), and its distortion by
-    ``k1``, ``k2``, ``p1``, ``p2``, ``k3`` or, for a fisheye, by ``k1`` to ``k4``; once for all, or in a frame. (Format:
-    Mildenhall et al., "NeRF", ECCV 2020, and the documentation of instant-ngp and nerfstudio.)
+    A frame's ``transform_matrix`` is camera-to-world, 4 x 4 or its first three rows. The camera is given by ``fl_x``,
+    ``fl_y``, ``cx``, ``cy``, ``w``, ``h`` or by ``camera_angle_x`` (radians, across the image), its distortion by
+    ``k1``, ``k2``, ``p1``, ``p2``, ``k3`` or, for a fisheye, by ``k1`` to ``k4``; for all frames, or in a frame.
+    (Format: Mildenhall et al., "NeRF", ECCV 2020, and the documentation of instant-ngp and nerfstudio.)
 
     Convention:
-        OpenGL axes (x right, y up, z backwards) become OpenCV's, and camera-to-world world-to-camera. Pixel centres
-        are half-integer: principal points lose 0.5. What the file leaves out is the image's size and its middle.
-        A rotation with a scale in it is refused, not divided by it. ``depth_file_path`` is a 16-bit PNG in
-        millimetres unless ``depth_unit_scale_factor`` says otherwise, camera z; where it has fewer or more pixels than
-        its image, and is of the same shape, its nearest pixels are taken. Masks are not read.
+        OpenGL axes (x right, y up, z backwards) become OpenCV's, and camera-to-world becomes world-to-camera. Pixel
+        centres are half-integer: 0.5 is subtracted from principal points. The size and the principal point default to
+        those of the image and its centre. A rotation with a scale is refused. ``depth_file_path`` is a 16-bit PNG of
+        camera z, in millimetres or ``depth_unit_scale_factor``; if it has the image's aspect ratio but another
+        resolution, its nearest pixels are used. Masks are not read.
 
     Args:
         path: the file, or a folder with ``transforms.json`` or with one ``transforms_*.json``.
 
     Returns:
-        The images with their cameras, cut out where any of them has alpha, straightened where they have
-        distortion; no sparse points.
+        The images with their cameras, cut out if any of them has alpha, undistorted if they have distortion; no sparse
+        points.
 
     Raises:
-        DataError: a file is missing, damaged or too large, names a file outside its folder, states a camera that makes
-            no sense or is of another size than its image, or the folder holds several files.
+        DataError: a file is missing, damaged or too large, names a file outside its folder, or states a camera that
+            is invalid or of another size than its image; or the folder has several files.
     """
     file = one_file(Path(path), *NAMES)
     values = read_json(file)
@@ -90,7 +90,7 @@ def read_transforms(path: str | Path) -> PosedImages:
     lenses: list[Lens | None] = []
     depths: list[DepthFile | None] = []
     cut_out = False
-    made: dict[tuple[Any, ...], Lens] = {}
+    shared: dict[tuple[Any, ...], Lens] = {}
     for index, frame in enumerate(frames):
         where = f"frame {index}"
         if not isinstance(frame, dict):
@@ -105,9 +105,9 @@ def read_transforms(path: str | Path) -> PosedImages:
         intrinsics.append(stated.intrinsics(size))
         poses.append(_pose(frame, file, where))
         lens = stated.lens(intrinsics[-1], size)
-        # Frames of one camera share one lens, which straightens them alike and is prepared once.
+        # Frames of one camera share one lens, whose maps are computed once.
         key = None if lens is None else (lens.kind, lens.intrinsics.tobytes(), lens.coefficients, size)
-        lenses.append(None if lens is None or key is None else made.setdefault(key, lens))
+        lenses.append(None if lens is None or key is None else shared.setdefault(key, lens))
         depths.append(stated.depth())
     height, width = torch.tensor(sizes).unbind(-1)
     with camera_errors_as_data_errors(file):
@@ -116,12 +116,12 @@ def read_transforms(path: str | Path) -> PosedImages:
 
 
 def _read_name(frame: dict[str, Any], key: str, file: Path, where: str) -> str:
-    # Files made on Windows have backslashes between folders.
+    # Files from Windows have backslashes between folders.
     return read_string(frame, key, file, where).replace("\\", "/")
 
 
 def _image(file: Path, name: str) -> Path:
-    """The image of a frame, whose name may lack what it ends with."""
+    """The image of a frame, whose name may lack its suffix."""
     path = path_inside(file.parent, name, file)
     if path.is_file():
         return path
@@ -129,7 +129,7 @@ def _image(file: Path, name: str) -> Path:
         longer = path_inside(file.parent, name + suffix, file)
         if longer.is_file():
             return longer
-    raise DataError(path, "no such image, nor one with .png, .jpg or .jpeg after it")
+    raise DataError(path, "no such image, also not with .png, .jpg or .jpeg added")
 
 
 def _pose(frame: dict[str, Any], file: Path, where: str) -> np.ndarray:
@@ -143,22 +143,22 @@ def _pose(frame: dict[str, Any], file: Path, where: str) -> np.ndarray:
 
 
 class _FrameCamera:
-    """What a file says of one frame's camera: in the frame itself, else for all."""
+    """The camera of one frame: its own values, else those for all frames."""
 
     def __init__(self, file: Path, where: str, values: dict[str, Any], frame: dict[str, Any]):
         self.file, self.where, self.frame, self.all = file, where, frame, ChainMap(frame, values)
         for key in REFUSED:
             if self.all.get(key, False) is not False:
-                raise DataError(file, f"{where}: {key} describes a camera that is neither pinhole nor OpenCV's")
+                raise DataError(file, f"{where}: {key} is of a camera that is neither a pinhole nor a model of OpenCV")
 
     def number(self, key: str, default: float | None = None, beyond: float = MAX_PARAMETER) -> float:
-        """A number, or the default where there is none."""
+        """A number, or the default if there is none."""
         if default is not None and key not in self.all:
             return default
         return read_number(self.all, key, self.file, self.where, beyond=beyond)
 
     def size(self, image: tuple[int, int]) -> tuple[int, int]:
-        """(height, width), the image's where the file says nothing."""
+        """(height, width), by default that of the image."""
         sides = []
         for key, side in zip(("h", "w"), image, strict=True):
             stated = self.number(key, side)
@@ -172,14 +172,14 @@ class _FrameCamera:
         height, width = size
         fx, fy = self._focal("x", width), self._focal("y", height)
         if fx is None and fy is None:
-            raise DataError(self.file, f"{self.where}: no focal length: neither fl_x nor camera_angle_x")
+            raise DataError(self.file, f"{self.where}: no focal length (fl_x or camera_angle_x)")
         fx, fy = fx or fy, fy or fx
         cx, cy = self.number("cx", width / 2), self.number("cy", height / 2)
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
     def _focal(self, axis: str, side: int) -> float | None:
         length, across = f"fl_{axis}", f"camera_angle_{axis}"
-        # What a frame says of its lens goes before what is said for all, in whichever words.
+        # A frame's own focal length takes precedence over that for all frames, under either key.
         scope = self.frame if length in self.frame or across in self.frame else self.all
         if length in scope:
             focal = read_number(scope, length, self.file, self.where, beyond=MAX_PARAMETER)
@@ -196,12 +196,12 @@ class _FrameCamera:
         return focal
 
     def lens(self, intrinsics: np.ndarray, size: tuple[int, int]) -> Lens | None:
-        """The lens, None where it is straight."""
+        """The lens, None without distortion."""
         kind = self._kind()
         coefficients = tuple(self.number(key, 0.0) for key in COEFFICIENTS[kind])
         for key in WITHOUT_MEANING[kind]:
             if self.number(key, 0.0):
-                raise DataError(self.file, f"{self.where}: {key} has no agreed meaning for a {kind} camera here")
+                raise DataError(self.file, f"{self.where}: {key} has no defined meaning for a {kind} camera")
         if kind == "perspective" and not any(coefficients):
             return None
         K = intrinsics.copy()
@@ -216,7 +216,7 @@ class _FrameCamera:
             return "perspective"
         if model in FISHEYE:
             return "fisheye"
-        raise DataError(self.file, f"{self.where}: camera_model {describe(model)} is not one that can be straightened")
+        raise DataError(self.file, f"{self.where}: camera_model {describe(model)} cannot be undistorted")
 
     def depth(self) -> DepthFile | None:
         """The depth of the frame."""
@@ -226,5 +226,5 @@ class _FrameCamera:
         step = self.number("depth_unit_scale_factor", DEPTH_STEP)
         if not step > 0:
             raise DataError(self.file, f"{self.where}: depth_unit_scale_factor must be positive; got {step:g}")
-        # Exports of telephones have depth of fewer pixels than their images.
+        # Exports of phones have depth of lower resolution than their images.
         return DepthPng(path_inside(self.file.parent, name, self.file), step, any_size=True)

@@ -1,6 +1,6 @@
-"""Reads files of OpenCV's FileStorage (YAML, XML, JSON) for `calibration`; imports nothing of this package.
+"""Parses OpenCV's FileStorage (YAML, XML, JSON) for `format_opencv`; imports nothing of this package.
 
-`parse_storage` runs in an isolated process, which the file may crash.
+`parse_storage` runs in an isolated process, since a damaged file can crash OpenCV's parser.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MOST_TEXT = 512
 
 
 def is_storage(path: Path) -> bool:
-    """Whether a file looks like one that FileStorage wrote: it holds its matrices, or, but for JSON, names images."""
+    """Whether a file looks like one of FileStorage: it has matrices, or (not JSON) names of images."""
     if path.suffix.lower() not in SUFFIXES or not path.is_file():
         return False
     with path.open("rb") as stream:
@@ -37,9 +37,9 @@ def is_storage(path: Path) -> bool:
 
 
 def parse_storage(content: bytes) -> dict[str, np.ndarray]:
-    """What stands at the top of a file: numbers (), texts (), lists of texts (N,), matrices (rows, columns).
+    """The top-level numbers (), texts (), lists of texts (N,) and matrices (rows, columns) of a file.
 
-    Numbers are float64, NaN what is none in a matrix. Everything else is left out.
+    Numbers are float64; elements of matrices that are not numbers become NaN. All other values are left out.
     """
     import cv2
 
@@ -50,18 +50,18 @@ def parse_storage(content: bytes) -> dict[str, np.ndarray]:
     if "\0" in text:
         raise ValueError("is not a text file (it holds a zero byte)")
     try:
-        # As text, so that the parser opens no file, neither this nor another or a compressed one.
+        # As text, so that the parser opens no file: not this one, another one, or a compressed one.
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
         names = root.keys() if root.isMap() else []
         if not 0 < len(names) <= MOST_ENTRIES or len(set(names)) != len(names):
-            raise ValueError("it holds no names, too many, or one twice")
+            raise ValueError("it has no names, too many, or a repeated one")
         values = {name: _value(root.getNode(name)) for name in names}
     except MemoryError:
         raise
-    # OpenCV's binding raises SystemError for what it cannot parse, and cv2.error for the rest.
+    # OpenCV's binding raises SystemError for text that it cannot parse, and cv2.error otherwise.
     except Exception as error:
-        raise ValueError(f"is no file of OpenCV's FileStorage ({str(error.__cause__ or error)[:200]})") from error
+        raise ValueError(f"is not a file of OpenCV's FileStorage ({str(error.__cause__ or error)[:200]})") from error
     return {name: value for name, value in values.items() if value is not None}
 
 
@@ -82,14 +82,14 @@ def _matrix(node: Any) -> np.ndarray | None:
     data, sizes = node.getNode("data"), node.getNode("sizes")
     rows, columns = (_number(node.getNode(name)) for name in ("rows", "cols"))
     if sizes.isSeq() and sizes.size() in (1, 2):
-        # OpenCV 5 writes vectors so.
+        # The form of vectors in OpenCV 5.
         rows, columns = _number(sizes.at(0)), _number(sizes.at(1)) if sizes.size() == 2 else 1.0
-    elif sizes.isInt():  # the same as XML
+    elif sizes.isInt():  # the same in XML
         rows, columns = _number(sizes), 1.0
-    # Of several channels, as corners in images have, nothing is used.
+    # Matrices of several channels, such as corners of chessboards, are not used.
     if not data.isSeq() or data.size() > MOST_VALUES or rows <= 0 or rows * columns != data.size():
         return None
-    # The numbers as they stand, not `node.mat()`: that one allocates what rows and columns ask for.
+    # Not `node.mat()`, which allocates the stated rows and columns.
     return np.array([_number(data.at(index)) for index in range(data.size())]).reshape(int(rows), int(columns))
 
 

@@ -34,14 +34,14 @@ __all__ = [
     "make_cameras",
 ]
 
-# An image server's largest images have such sides; what is beyond is a damaged number.
+# The largest images have such sides; a larger number is damaged.
 MAX_SIDE = 1 << 17
 MAX_PARAMETER = 1e7
 
 
 @contextlib.contextmanager
 def camera_errors_as_data_errors(file: Path) -> Iterator[None]:
-    """Turn what the library says of cameras into an error of the file that states them."""
+    """Turn errors of cameras into a DataError of the file that states them."""
     try:
         yield
     except DataError:
@@ -51,11 +51,7 @@ def camera_errors_as_data_errors(file: Path) -> Iterator[None]:
 
 
 def check_intrinsics(intrinsics: np.ndarray, file: Path, where: str) -> None:
-    """Check K, (3, 3).
-
-    Raises:
-        DataError: not upper triangular with positive focal lengths and the last row 0 0 1, or beyond 1e7 pixels.
-    """
+    """Raise a DataError unless K (3, 3) is upper triangular with positive focal lengths and last row 0 0 1."""
     lower = intrinsics[[1, 2, 2], [0, 0, 1]]
     if np.abs(lower).max() > 1e-9 or abs(intrinsics[2, 2] - 1) > 1e-9 or min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
         raise DataError(file, f"{where}: K must be upper triangular with positive focal lengths and last row 0 0 1")
@@ -64,19 +60,15 @@ def check_intrinsics(intrinsics: np.ndarray, file: Path, where: str) -> None:
 
 
 def check_rotation(rotation: np.ndarray, file: Path, where: str) -> None:
-    """Check a rotation, (3, 3), as far as single precision and rounded decimals leave it one.
-
-    Raises:
-        DataError: it is scaled, mirrored, or no rotation at all; the reason says which.
-    """
-    # In units of its own size, which is 1 for a rotation: numbers in a file may be large enough to overflow.
+    """Raise a DataError unless R (3, 3) is a rotation within rounding; the reason says if it is scaled or mirrored."""
+    # Divided by its size, which is 1 for a rotation: numbers in a file may be large enough to overflow.
     size = float(np.abs(rotation).max())
     unit = rotation / size if size > 0 else rotation
     scale = size * float(np.sqrt((unit * unit).sum() / 3))
     unit = rotation / scale if scale > 0 else rotation
     rigid = scale > 0 and np.abs(unit.T @ unit - np.eye(3)).max() <= 1e-3
     if not rigid:
-        raise DataError(file, f"{where}: the rotation is none: its columns are not perpendicular and of one length")
+        raise DataError(file, f"{where}: not a rotation: its columns are not perpendicular and of one length")
     if np.linalg.det(unit) < 0:
         raise DataError(
             file, f"{where}: the rotation is mirrored (determinant -1): an axis is flipped or two exchanged"
@@ -86,32 +78,24 @@ def check_rotation(rotation: np.ndarray, file: Path, where: str) -> None:
 
 
 def check_camera(intrinsics: np.ndarray, rotation: np.ndarray, file: Path, where: str) -> None:
-    """Check K and a rotation, (3, 3) each, see `check_intrinsics` and `check_rotation`."""
+    """`check_intrinsics` and `check_rotation`."""
     check_intrinsics(intrinsics, file, where)
     check_rotation(rotation, file, where)
 
 
 def check_last_row(pose: np.ndarray, file: Path, what: str) -> None:
-    """Check that the last row of a pose, (4, 4), is 0 0 0 1.
-
-    Raises:
-        DataError: it is another one.
-    """
+    """Raise a DataError unless the last row of a pose (4, 4) is 0 0 0 1."""
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise DataError(file, f"{what} must have the last row 0 0 0 1")
 
 
 def check_image_size(stated: tuple[float, float], found: tuple[int, int], image: Path, file: Path, where: str) -> None:
-    """Compare the (height, width) that a camera is made for with that of its image.
-
-    Raises:
-        DataError: they differ, so that K belongs to another resolution.
-    """
+    """Raise a DataError unless the (height, width) of a camera is that of its image."""
     if stated != found:
         raise DataError(
             file,
-            f"{where}: the camera is of {stated[1]:g} x {stated[0]:g} pixels and {image.name!r} has "
-            f"{found[1]} x {found[0]} (width x height): K of another resolution (lsmgeo.cameras.resize makes K follow)",
+            f"{where}: the camera has {stated[1]:g} x {stated[0]:g} pixels and {image.name!r} has "
+            f"{found[1]} x {found[0]} (width x height): K of another resolution (lsmgeo.cameras.resize scales K)",
         )
 
 
@@ -124,11 +108,7 @@ def make_cameras(
     *,
     pixel_center: str = "integer",
 ) -> CameraTensors:
-    """Make cameras (V,) of K (V, 3, 3), world-to-camera R (V, 3, 3) and t (V, 3), and (height, width) of each image.
-
-    Raises:
-        DataError: one of them is no camera; ``file`` states it.
-    """
+    """Cameras (V,) from K (V, 3, 3), world-to-camera R (V, 3, 3), t (V, 3) and sizes; a DataError of ``file``."""
     K, R, t = (torch.from_numpy(np.array(part, np.float64)) for part in (intrinsics, rotations, translations))
     height, width = torch.tensor(sizes).unbind(-1)
     with camera_errors_as_data_errors(file):
@@ -149,28 +129,28 @@ def assemble(
     voxels: Voxels | None = None,
     category: str | None = None,
 ) -> PosedImages:
-    """Make a scene of what a reader has found; images with a lens get the camera of what it straightens them to.
+    """Make the scene of a reader, see `PosedImages`.
 
     Args:
-        names: one an image, none twice.
+        names: a different one for each image.
         paths: their files.
-        cameras: leading shape (V,), with K as each image was taken.
-        source: the format's name.
-        file: what stated the cameras, for errors.
-        lenses: one an image, or nothing.
-        points: sparse points, their observations in straightened pixels.
-        depths: one an image, or nothing.
-        cut_out: as in `PosedImages`.
-        voxels: as in `PosedImages`.
-        category: as in `PosedImages`.
+        cameras: leading shape (V,), with K as each image was taken; images with a lens get K of its `Lens.pinhole`.
+        source: the name of the format.
+        file: the file that states the cameras, for errors.
+        lenses: one for each image, or nothing.
+        points: sparse points with their observations in undistorted pixels.
+        depths: one for each image, or nothing.
+        cut_out: whether alpha is a silhouette.
+        voxels: the object.
+        category: of the object.
 
     Raises:
-        DataError: a name is given twice, or a lens cannot be straightened.
+        DataError: a name is used twice, or the distortion of a lens cannot be removed.
     """
     if len(set(names)) != len(names):
-        raise DataError(file, "names an image twice")
-    bent = [lens is not None for lens in lenses]
-    if any(bent):
+        raise DataError(file, "uses an image name twice")
+    has_lens = any(lens is not None for lens in lenses)
+    if has_lens:
         K = list(cameras.intrinsics)
         with camera_errors_as_data_errors(file):
             for view, lens in enumerate(lenses):
@@ -182,7 +162,7 @@ def assemble(
         cameras,
         points,
         source,
-        lenses=tuple(lenses) if any(bent) else None,
+        lenses=tuple(lenses) if has_lens else None,
         depths=tuple(depths) if any(depth is not None for depth in depths) else None,
         cut_out=cut_out,
         voxels=voxels,

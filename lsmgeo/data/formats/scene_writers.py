@@ -1,4 +1,4 @@
-"""Posed images as other programs want them: a COLMAP model, a ``transforms.json``, a plain JSON file."""
+"""Writing posed images as a COLMAP model, ``transforms.json`` or plain JSON, and point clouds as PLY."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ def write_colmap(images: PosedImages, folder: str | PathLike[str]) -> Path:
     """Write posed images as a COLMAP model in text form: ``sparse/0`` and ``images``.
 
     Convention:
-        COLMAP's: world-to-camera quaternions, half-integer pixel centres (principal points and observations gain
-        0.5). All cameras are PINHOLE: images taken through a lens are written straightened, as PNG; all others
-        byte by byte. A rotation that is only nearly one is written as the nearest, about the same camera centre.
-        Blanks in names become underscores, which COLMAP's text form cannot hold. Depth and voxels are not written.
+        COLMAP's: world-to-camera quaternions, half-integer pixel centres (0.5 is added to principal points and
+        observations). All cameras are PINHOLE: images with distortion are undistorted and written as PNG, all others
+        are copied. A rounded rotation is written as the nearest rotation with the same camera centre. Spaces in names
+        become underscores, since COLMAP's text form cannot have them. Depth and voxels are not written.
 
     Args:
-        images: the images; their sparse points and observations are written too.
-        folder: the folder to make, which must not exist or be empty; it is there whole or not at all.
+        images: the images, with their sparse points and observations.
+        folder: the folder to make, atomically; it must not exist, or be empty.
 
     Returns:
         The folder.
 
     Raises:
-        OptionError: a camera has skew, which COLMAP cannot hold.
-        DataError: the folder is there already or cannot be written, or an image cannot be read.
+        OptionError: a camera has skew, which COLMAP does not support.
+        DataError: the folder exists or cannot be written, or an image cannot be read.
     """
     _refuse_skew("write_colmap", "COLMAP", images)
     names = _file_names(images, blank="_")
@@ -71,24 +71,23 @@ def write_colmap(images: PosedImages, folder: str | PathLike[str]) -> Path:
 
 
 def write_transforms(images: PosedImages, folder: str | PathLike[str]) -> Path:
-    """Write posed images as ``transforms.json`` and ``images``, as instant-ngp and nerfstudio read them.
+    """Write posed images as ``transforms.json`` and ``images``, for instant-ngp and nerfstudio.
 
     Convention:
-        Camera-to-world, OpenGL axes, half-integer pixel centres (principal points gain 0.5); no distortion:
-        images taken through a lens are written straightened, as PNG; all others byte by byte. A rotation that is
-        only nearly one is written as the nearest, about the same camera centre. Points, depth and voxels are not
-        written.
+        Camera-to-world, OpenGL axes, half-integer pixel centres (0.5 is added to principal points). Images with
+        distortion are undistorted and written as PNG, all others are copied. A rounded rotation is written as the
+        nearest rotation with the same camera centre. Points, depth and voxels are not written.
 
     Args:
         images: the images.
-        folder: the folder to make, which must not exist or be empty; it is there whole or not at all.
+        folder: the folder to make, atomically; it must not exist, or be empty.
 
     Returns:
         The folder.
 
     Raises:
-        OptionError: a camera has skew, which the format cannot hold.
-        DataError: the folder is there already or cannot be written, or an image cannot be read.
+        OptionError: a camera has skew, which the format does not support.
+        DataError: the folder exists or cannot be written, or an image cannot be read.
     """
     _refuse_skew("write_transforms", "transforms.json", images)
     names = _file_names(images)
@@ -114,30 +113,29 @@ def write_transforms(images: PosedImages, folder: str | PathLike[str]) -> Path:
 
 
 def write_cameras_json(images: PosedImages, path: str | PathLike[str]) -> Path:
-    """Write posed images as a plain JSON file of cameras, which `read_cameras_json` describes.
+    """Write posed images as a plain JSON file of cameras, see `read_cameras_json`.
 
     Convention:
-        Ours: world-to-camera, OpenCV axes, integer pixel centres, K with its skew. Nothing is rounded. Points, depth
-        and voxels are not written.
+        World-to-camera, OpenCV axes, integer pixel centres, K with skew. Nothing is rounded. Points, depth and voxels
+        are not written.
 
     Args:
         images: the images.
-        path: a folder to make, which must not exist or be empty, for ``cameras.json`` and ``images``; or a file that
-            ends in ``.json``, in a folder that has all the images in or below it, for the cameras alone, where it
-            replaces one that is there.
+        path: a folder to make, which must not exist or be empty, for ``cameras.json`` and ``images``; or a ``.json``
+            file for only the cameras, in a folder with all the images in or below it; it may exist.
 
     Returns:
         The path.
 
     Raises:
-        OptionError: cameras alone are asked for, and an image lies elsewhere or was taken through a lens.
-        DataError: the folder is there already, something cannot be written, or an image cannot be read.
+        OptionError: only cameras are written, and an image is elsewhere or has distortion.
+        DataError: the folder exists, a file cannot be written, or an image cannot be read.
     """
     path = Path(path)
-    alone = path.suffix.lower() == ".json"
-    names = _below(images, path.parent) if alone else [f"{IMAGES}/{name}" for name in _file_names(images)]
+    only_cameras = path.suffix.lower() == ".json"
+    names = _below(images, path.parent) if only_cameras else [f"{IMAGES}/{name}" for name in _file_names(images)]
     cameras = [{"file": name} | camera_entry(images.camera(view)) for view, name in enumerate(names)]
-    if alone:
+    if only_cameras:
         return write_atomic(path, encode_cameras(cameras))
     with atomic_folder(path) as made:
         _write_images(images, names, made)
@@ -149,32 +147,32 @@ def _below(images: PosedImages, folder: Path) -> list[str]:
     """The images' paths relative to the folder."""
     if images.lenses is not None:
         raise OptionError(
-            "write_cameras_json: path must be a folder for images taken through a lens, which are written "
-            "straightened; got a file"
+            "write_cameras_json: path must be a folder if images have distortion, as they are written undistorted; "
+            "got a file"
         )
     names = []
     for path in images.paths:
         if not path.resolve().is_relative_to(folder.resolve()):
-            raise OptionError(f"write_cameras_json: images must lie below the folder of the file; got {path}")
+            raise OptionError(f"write_cameras_json: images must be below the folder of the file; got {path}")
         names.append(path.resolve().relative_to(folder.resolve()).as_posix())
     return names
 
 
 def _file_names(images: PosedImages, *, blank: str = " ") -> list[str]:
-    """What the images are called below ``images``: as their source does, with what their files end with."""
+    """The names of the images below ``images``: those of their source, with the suffixes of their files."""
     names = []
     for view, name in enumerate(images.names):
         parts = [part for part in PurePosixPath(name).parts if part not in ("..", "/")]
-        # A scene that was written here comes back with images/ before every name.
+        # Names of scenes that lsmgeo has written begin with images/.
         plain = PurePosixPath(*(parts[1:] if len(parts) > 1 and parts[0] == IMAGES else parts))
         suffix = images.paths[view].suffix
-        bent = images.lenses is not None and images.lenses[view] is not None
+        has_lens = images.lenses is not None and images.lenses[view] is not None
         if plain.suffix.lower() not in SUFFIXES:
-            plain = plain.with_name(plain.name + (".png" if bent else suffix))
-        names.append(str(plain.with_suffix(".png") if bent else plain).replace(" ", blank))
+            plain = plain.with_name(plain.name + (".png" if has_lens else suffix))
+        names.append(str(plain.with_suffix(".png") if has_lens else plain).replace(" ", blank))
     twice = next((name for name in names if names.count(name) > 1), None) if len(set(names)) < len(names) else None
     if twice is not None:
-        raise DataError(images.paths[names.index(twice)], f"is one of two images that would be called {twice!r}")
+        raise DataError(images.paths[names.index(twice)], f"is one of two images that would be named {twice!r}")
     return names
 
 
@@ -197,25 +195,25 @@ def _refuse_skew(who: str, what: str, images: PosedImages) -> None:
     for view in (K[:, 0, 1].abs() > 1e-6 * K[:, 0, 0]).nonzero()[:1, 0].tolist():
         skew = float(K[view, 0, 1])
         raise OptionError(
-            f"{who}: cameras must have no skew, which {what} cannot hold; {images.names[view]!r} has {skew:g}"
+            f"{who}: cameras must have no skew, which {what} does not support; {images.names[view]!r} has {skew:g}"
         )
 
 
 def _as_rigid(cameras: CameraTensors) -> CameraTensors:
-    """The nearest rotations, about the same camera centres: quaternions and inverses of rounded ones would differ."""
+    """The nearest rotations with the same camera centres: quaternions and inverses of rounded ones would differ."""
     E = cameras.cam_from_world.double()
     U, _, V = torch.linalg.svd(E[:, :3, :3])
     near = U @ V
     rigid = E.clone()
     rigid[:, :3, :3] = near
     rigid[:, :3, 3] = (near @ torch.linalg.solve(E[:, :3, :3], E[:, :3, 3:]))[..., 0]
-    # What is a rotation already stays as it is to the last digit.
+    # Exact rotations are unchanged, to the last digit.
     exact = ((near - E[:, :3, :3]).abs() < 1e-12).all(-1).all(-1)
     return cameras._replace(cam_from_world=torch.where(exact[:, None, None], E, rigid))
 
 
 def _joined(*values: float) -> str:
-    # repr() of a double reads back to the last digit.
+    # repr() of a double is exact.
     return " ".join(repr(float(value)) for value in values)
 
 
@@ -236,7 +234,7 @@ def _points(images: PosedImages) -> list[str]:
         for index, point in enumerate(observed.points.tolist()):
             tracks[point].append(f"{view + 1} {index}")
     rows = zip(images.points.positions, images.points.colours.tolist(), tracks, strict=True)
-    # -1 is COLMAP's error of reprojection that nobody has computed.
+    # -1 is COLMAP's value for an unknown reprojection error.
     return [
         " ".join([str(index), _joined(*position), *map(str, colour), "-1", *track])
         for index, (position, colour, track) in enumerate(rows, 1)
@@ -255,7 +253,7 @@ def write_point_cloud(path: str | PathLike[str], positions: np.ndarray, colours:
         The path written.
 
     Raises:
-        DataError: there is no point, shapes do not agree, a position is not finite, or the file cannot be written.
+        DataError: there is no point, shapes do not match, a position is not finite, or the file cannot be written.
     """
     positions = np.asarray(positions)
     colours = np.asarray(colours)

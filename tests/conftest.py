@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -42,3 +43,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         path = Path(item.path)
         if path in not_counted or not any(path.is_relative_to(folder) for folder in counted):
             item.add_marker("no_cover")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Fail where a test file cannot be imported: the doctest plugin skips it, and pytest then finds no tests in it."""
+    report = yield
+    if report.skipped and "unable to import module" in str(report.longrepr) and collector.path.name.startswith("test_"):
+        report.outcome = "failed"
+    return report

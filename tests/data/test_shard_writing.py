@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lsmgeo.data import ShardSet, encode_sample, files, verify_shard, write_shard
+from lsmgeo.data import ShardSet, atomic_files, encode_sample, verify_shard, write_shard
 from lsmgeo.data.shards import shard_index, write_shards
 from lsmgeo.errors import DataError, OptionError
 from tests.data.shapes import SETTINGS, assert_equal, make_shape
@@ -49,7 +49,7 @@ def test_a_full_disk_is_told(tmp_path, monkeypatch):
     def full(descriptor):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(files.os, "fsync", full)
+    monkeypatch.setattr(atomic_files.os, "fsync", full)
     with pytest.raises(DataError, match=r"a.tar: cannot be written .*No space left"):
         write_shard(tmp_path / "a.tar", [(0, encode_sample(SAMPLE, 0))], SETTINGS)
     assert list(tmp_path.iterdir()) == []
@@ -93,7 +93,7 @@ class Stops:
 
     def __init__(self, monkeypatch, at=None):
         self.count, self.at = 0, at
-        for owner, name in ((files.AtomicFile, "write"), (files.os, "fsync"), (Path, "replace"),
+        for owner, name in ((atomic_files.AtomicFile, "write"), (atomic_files.os, "fsync"), (Path, "replace"),
                             (Path, "unlink")):  # fmt: skip
             monkeypatch.setattr(owner, name, self.wrapped(getattr(owner, name)))
 

@@ -13,7 +13,7 @@ from lsmgeo import scenes
 from lsmgeo.data import Mesh, from_trimesh, load_mesh, normalise, voxelise
 from lsmgeo.data.meshes.mesh_topology import merged_faces, parts_of
 from lsmgeo.data.meshes.scan_conversion import LINES, cells_touched, crossings
-from lsmgeo.data.meshes.voxelise import _by_vote as by_vote
+from lsmgeo.data.meshes.voxelise import _vote_inside as by_vote
 from lsmgeo.data.meshes.voxelise import plan_voxels, winding_number
 from lsmgeo.errors import BackendError, DTypeError, GridError, OptionError
 from lsmgeo.scenes.meshing import to_mesh

@@ -1,4 +1,4 @@
-"""Analytic scenes: exact ray hits, depth, normals, silhouettes and occupancy of solids and their unions."""
+"""Analytic scenes: exact ray hits, depth, normals, silhouettes and occupancy of CSG solids and their unions."""
 
 from lsmgeo.scenes.backgrounds import background
 from lsmgeo.scenes.inside import occupancy, voxels

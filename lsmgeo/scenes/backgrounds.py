@@ -1,4 +1,4 @@
-"""Random pictures to stand behind objects: analytic, so that a training set needs no photographs."""
+"""Random images as backgrounds of objects: analytic, so a training set needs no photos."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ __all__ = ["background"]
 
 
 def background(generator: np.random.Generator, height: int, width: int) -> Tensor:
-    """A random picture: a gradient, plane waves, a checkerboard, stripes or blobs, in two or three colours.
+    """A random image: a gradient, plane waves, a checkerboard, stripes or blobs, in two or three colours.
 
-    Two such patterns are drawn half of the time, one blended over the other. Lengths follow the longer side, so the
-    same draw looks alike at every size.
+    With probability one half it is a blend of two such patterns. Lengths are relative to the longer side, so equal
+    draws look alike at every size.
 
     Args:
-        generator: the source of randomness; equal states give equal pictures.
+        generator: the source of randomness; equal states give equal images.
         height: pixels.
         width: pixels.
 
@@ -38,11 +38,11 @@ def background(generator: np.random.Generator, height: int, width: int) -> Tenso
     longer = max(height, width)
     y = (torch.arange(height, dtype=torch.float32) - (height - 1) / 2)[:, None] / longer
     x = (torch.arange(width, dtype=torch.float32) - (width - 1) / 2) / longer
-    picture = _coloured(generator, _pattern(generator, y, x))
+    image = _coloured(generator, _pattern(generator, y, x))
     if generator.random() < 0.5:
         over, share = _coloured(generator, _pattern(generator, y, x)), float(generator.uniform(0.2, 0.6))
-        picture = picture.lerp(over, share)
-    return picture.clamp_(0, 1)
+        image = image.lerp(over, share)
+    return image.clamp_(0, 1)
 
 
 def _coloured(generator: np.random.Generator, mix: Tensor) -> Tensor:
@@ -67,9 +67,9 @@ def _pattern(generator: np.random.Generator, y: Tensor, x: Tensor) -> Tensor:
     if kind == 3:
         total = torch.zeros(y.shape[0], x.shape[0])
         for _ in range(5):
-            turn, shift = generator.uniform(0, 2 * np.pi, 2)
+            angle, shift = generator.uniform(0, 2 * np.pi, 2)
             frequency = 2 * np.pi * generator.uniform(1, 10)
-            total += torch.sin(frequency * (x * np.cos(turn) + y * np.sin(turn)) + shift)
+            total += torch.sin(frequency * (x * np.cos(angle) + y * np.sin(angle)) + shift)
         return total / 10 + 0.5
     total = torch.zeros(y.shape[0], x.shape[0])
     for _ in range(int(generator.integers(4, 12))):

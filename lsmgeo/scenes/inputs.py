@@ -1,4 +1,4 @@
-"""What renderers are given besides geometry, checked: lights, and what is behind the surfaces."""
+"""Checked inputs of the renderers besides geometry: lights and backgrounds."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from lsmgeo._checks import check_float, describe
 from lsmgeo.errors import DTypeError, ShapeError
 from lsmgeo.scenes.lighting import Lights
 
-__all__ = ["behind", "checked_lights"]
+__all__ = ["background_array", "checked_lights"]
 
 
 def checked_lights(who: str, lights: Lights, count: int, device: torch.device, dtype: torch.dtype) -> Lights:
-    """The lights with a leading axis of scenes, detached, on the device that renders.
+    """The lights with a leading axis of scenes, detached, on the rendering device.
 
     Args:
-        who: the function that asks, named in errors.
+        who: the calling function, for messages.
         lights: directions and colours (S, L, 3), ambient (S, 3), or all without S.
         count: S.
         device: of the result.
         dtype: of the result.
 
     Raises:
-        DTypeError: no `Lights` of floating-point tensors.
-        ShapeError: shapes that do not belong together.
+        DTypeError: not `Lights` of floating-point tensors.
+        ShapeError: inconsistent shapes.
     """
     if not isinstance(lights, Lights):
         raise DTypeError(f"{who}: lights must be Lights; got {describe(lights)}")
@@ -48,13 +48,13 @@ def checked_lights(who: str, lights: Lights, count: int, device: torch.device, d
     return Lights(*whole)
 
 
-def behind(
+def background_array(
     who: str, value: Tensor | Sequence[float], shape: tuple[int, ...], device: torch.device, dtype: torch.dtype
 ) -> Tensor:
-    """A new contiguous array of the images' shape (..., 3, H, W) that holds what is behind the surfaces.
+    """The background as a new contiguous array of the images' shape (..., 3, H, W).
 
     Raises:
-        ShapeError: neither RGB (3,) nor something that broadcasts to the shape.
+        ShapeError: not RGB (3,), and it does not broadcast to the shape.
     """
     try:
         colour = torch.as_tensor(value, device=device, dtype=dtype).detach()

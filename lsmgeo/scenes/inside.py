@@ -14,7 +14,7 @@ from lsmgeo.scenes.tables import Placed, Scene, Tables, check_scenes, layout
 
 __all__ = ["occupancy", "voxels"]
 
-# Points of one scene that are tested together: their local coordinates fit the caches.
+# Points of one scene that are tested together: their local coordinates fit into the caches.
 POINTS_AT_ONCE = 1 << 15
 # Boxes around solids are widened by this, for rounding.
 MARGIN = 1e-9
@@ -25,7 +25,7 @@ def occupancy(scenes: Sequence[Scene], points: Tensor) -> Tensor:
     """Whether points lie inside scenes: in a solid and in none of its cuts.
 
     Convention:
-        A solid contains its surface, and so does what is cut out of it. Arithmetic is float64.
+        A primitive contains its surface, also when it is subtracted. Arithmetic is float64.
 
     Args:
         scenes: S scenes.
@@ -35,7 +35,7 @@ def occupancy(scenes: Sequence[Scene], points: Tensor) -> Tensor:
         (S, ...) bool.
 
     Raises:
-        OptionError: something else than `Scene`.
+        OptionError: not a sequence of `Scene`.
         ShapeError: points that are not (S, ..., 3).
 
     Example:
@@ -60,14 +60,14 @@ def voxels(scenes: Sequence[Scene], grid: VoxelGrid | int | tuple[int, int, int]
 
     Args:
         scenes: S scenes.
-        grid: a `lsmgeo.VoxelGrid` without a batch, or n or (D, H, W) for so many voxels over [-0.5, 0.5]^3.
+        grid: a `lsmgeo.VoxelGrid` without a batch, or n or (D, H, W) voxels over [-0.5, 0.5]^3.
 
     Returns:
         (S, D, H, W) bool.
 
     Raises:
-        OptionError: something else than `Scene`.
-        ShapeError: a grid with one pose a scene.
+        OptionError: not a sequence of `Scene`.
+        ShapeError: a grid with one pose per scene.
 
     Example:
         >>> from lsmgeo import scenes
@@ -89,27 +89,27 @@ def voxels(scenes: Sequence[Scene], grid: VoxelGrid | int | tuple[int, int, int]
 
 def _occupied(scene: Scene, points: Tensor) -> Tensor:
     """Whether points (N, 3) lie in a scene."""
-    solids, (placed,) = layout([scene])
-    solids = solids.to(points.device, torch.float64)
+    tables, (placed,) = layout([scene])
+    tables = tables.to(points.device, torch.float64)
     inside = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for first in range(0, len(points), POINTS_AT_ONCE):
         block = points[first : first + POINTS_AT_ONCE].T.double()  # (3, K)
 
         def local(row: int, block: Tensor = block) -> Tensor:
-            offset = block - solids.center[row, :, None]
-            return (solids.linear[row, :, :, None] * offset).sum(1)
+            offset = block - tables.center[row, :, None]
+            return (tables.linear[row, :, :, None] * offset).sum(1)
 
         for solid in placed:
-            inside[first : first + POINTS_AT_ONCE] |= _remains(solids, solid, local)
+            inside[first : first + POINTS_AT_ONCE] |= _inside_solid(tables, solid, local)
     return inside
 
 
 def _occupied_lattice(scene: Scene, axes: list[Tensor]) -> Tensor:
-    """The same for the points of a lattice along the world's axes, (W,), (H,) and (D,): (D, H, W).
+    """Occupancy (D, H, W) of a lattice along the world's axes, (W,), (H,) and (D,).
 
-    A solid is looked for within the box around it; local coordinates are a sum of one term an axis.
+    A solid is tested within its bounding box; local coordinates are a sum of one term per axis.
     """
-    solids, (placed,) = layout([scene])
+    tables, (placed,) = layout([scene])
     inside = torch.zeros([len(axis) for axis in reversed(axes)], dtype=torch.bool)
     for solid, part in zip(placed, scene.solids, strict=True):
         x, y, z = (
@@ -120,29 +120,29 @@ def _occupied_lattice(scene: Scene, axes: list[Tensor]) -> Tensor:
 
         def local(row: int, some: list[Tensor] = some) -> Tensor:
             along = [
-                solids.linear[row, :, axis, None] * (values - solids.center[row, axis])  # (3, W), (3, H), (3, D)
+                tables.linear[row, :, axis, None] * (values - tables.center[row, axis])  # (3, W), (3, H), (3, D)
                 for axis, values in enumerate(some)
             ]
             return along[0][:, None, None, :] + along[1][:, None, :, None] + along[2][:, :, None, None]
 
-        inside[z, y, x] |= _remains(solids, solid, local)
+        inside[z, y, x] |= _inside_solid(tables, solid, local)
     return inside
 
 
-def _remains(solids: Tables, solid: Placed, local: Callable[[int], Tensor]) -> Tensor:
+def _inside_solid(tables: Tables, solid: Placed, local: Callable[[int], Tensor]) -> Tensor:
     """Whether points lie in a solid and in none of its cuts; ``local`` gives their coordinates (3, ...) for a row."""
-    held = _holds(solids, solid.row, local(solid.row))
+    inside = _contains(tables, solid.row, local(solid.row))
     for _, cut in solid.cuts:
-        held &= ~_holds(solids, cut, local(cut))
-    return held
+        inside &= ~_contains(tables, cut, local(cut))
+    return inside
 
 
-def _holds(solids: Tables, row: int, local: Tensor) -> Tensor:
-    """Whether local points (3, ...) lie in one solid, by the functions whose zeros are its faces (see `Tables`)."""
+def _contains(tables: Tables, row: int, local: Tensor) -> Tensor:
+    """Whether local points (3, ...) lie in a primitive, by the functions whose zeros are its faces (see `Tables`)."""
     shape = (3,) + (1,) * (local.dim() - 1)
-    within = ((local <= solids.high[row].view(shape)) & (local >= solids.low[row].view(shape))).all(0)
-    if bool(solids.round[row].any()):
-        radial = (solids.round[row].view(shape) * local.square()).sum(0)
-        radius = solids.radius[row] + solids.slope[row] * local[1]
+    within = ((local <= tables.high[row].view(shape)) & (local >= tables.low[row].view(shape))).all(0)
+    if bool(tables.round[row].any()):
+        radial = (tables.round[row].view(shape) * local.square()).sum(0)
+        radius = tables.radius[row] + tables.slope[row] * local[1]
         within &= radial <= radius.square()
     return within

@@ -1,7 +1,7 @@
-"""Where a ray is inside a canonical solid: one interval of its parameter, in closed form.
+"""Where a ray is inside a canonical primitive: one interval of its parameter, in closed form.
 
-A convex solid meets a ray in one interval, so these five functions are all that visibility, shadows and cuts need. The
-ray is ``p + s d`` in the solid's local coordinates; a miss is an interval whose end lies before its start.
+A ray intersects a convex primitive in one interval, so these five functions suffice for visibility, shadows and CSG
+subtraction. The ray is ``p + s d`` in local coordinates; a miss is an interval whose end is before its start.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ __all__ = ["interval"]
 
 Interval = tuple[Tensor, Tensor]
 
-# Stands for a divisor of exactly 0: its reciprocal is still finite in float32.
+# Replaces a divisor of exactly 0: its reciprocal is still finite in float32.
 TINY = 1e-30
 
 
 def interval(kind: Kind, p: Tensor, d: Tensor, taper: Tensor | float = 1.0) -> Interval:
-    """The part of rays inside a canonical solid.
+    """The intervals of rays inside a canonical primitive.
 
     Args:
-        kind: which solid (see `Kind`).
+        kind: the primitive (see `Kind`).
         p: (..., 3, H, W) points of the rays at s = 0, local coordinates; any two trailing axes.
         d: (..., 3, H, W) directions, need not be unit.
         taper: of a cone, broadcasts against (..., H, W).
@@ -80,9 +80,9 @@ def _quadric(a: Tensor, b: Tensor, c: Tensor) -> Interval:
 
 
 def _nappe(a: Tensor, b: Tensor, c: Tensor, change: Tensor) -> Interval:
-    """The same for a cone, where a may be negative: then the ray stays within one of the two nappes for good.
+    """The same for a cone, where a may be negative: then the ray enters one of the two nappes and stays inside.
 
-    The root that cancels is taken from the product of both, so that a = 0 needs no case of its own.
+    The root with cancellation is computed from the product of both, so a = 0 is no special case.
     """
     a = _not_zero(a)
     discriminant = b * b - a * c

@@ -1,4 +1,4 @@
-"""Lambertian shading, the same for analytic scenes and for rendered meshes."""
+"""Lambertian shading, for analytic scenes and for rendered meshes."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class Lights(NamedTuple):
 
     Attributes:
         directions: (..., L, 3) unit vectors, world frame, from the surface towards each light.
-        colours: (..., L, 3) RGB intensities; 1 lights a white surface that faces the light fully.
-        ambient: (..., 3) RGB, reaches every surface.
+        colours: (..., L, 3) RGB intensities; at 1 a white surface that faces the light has full brightness.
+        ambient: (..., 3) RGB intensity on every surface.
     """
 
     directions: Tensor
@@ -27,7 +27,7 @@ class Lights(NamedTuple):
 def shade(albedo: Tensor, normals: Tensor, lights: Lights, lit: Tensor | None = None) -> Tensor:
     """The colour of Lambertian surfaces.
 
-    Equation: albedo (ambient + sum over l of max(0, <n, d_l>) colour_l), no more than 1.
+    Equation: albedo (ambient + sum over l of max(0, <n, d_l>) colour_l), at most 1.
 
     Args:
         albedo: (..., 3) RGB.

@@ -18,20 +18,20 @@ __all__ = ["to_mesh"]
 
 
 def to_mesh(scene: Scene, *, segments: int = 64) -> trimesh.Trimesh:
-    """The union of a scene's solids as one closed mesh, each face in the plain colour of its part.
+    """The union of a scene's solids as one closed mesh, each face in the plain colour of its solid.
 
-    Round parts become polyhedra with vertices on the true surface, so a mesh lies inside its scene, but for surfaces
-    that were cut; the lost volume falls with the square of ``segments``. Textures are left out.
+    Round primitives become polyhedra with vertices on the true surface, so the mesh lies inside the scene, except at
+    subtracted primitives; the volume error falls with the square of ``segments``. Textures are ignored.
 
     Args:
-        scene: a scene without half-spaces among its parts; half-spaces that clip a part are fine.
-        segments: vertices in a full circle, at least 8 and a multiple of 4, so that round parts reach their bounds.
+        scene: a scene without half-spaces among its solids; as cuts they are allowed.
+        segments: vertices of a full circle, a multiple of 4 and at least 8, so that round solids reach their bounds.
 
     Returns:
         A watertight mesh with outward faces, in the scene's frame; a face's colour is 8-bit RGBA.
 
     Raises:
-        OptionError: no `Scene`, a part that is a half-space, an impossible number of segments.
+        OptionError: not a `Scene`, a solid that is a half-space, or an invalid number of segments.
 
     Example:
         >>> from lsmgeo.scenes import Scene, box, half_space
@@ -48,14 +48,14 @@ def to_mesh(scene: Scene, *, segments: int = 64) -> trimesh.Trimesh:
     if not is_whole(segments) or segments < 8 or segments % 4:
         raise OptionError(f"to_mesh: segments must be a multiple of 4, at least 8; got {segments!r}")
     if any(solid.kind is Kind.HALF_SPACE for solid in scene.solids):
-        raise OptionError("to_mesh: a half-space has no closed surface; expected parts of finite size")
+        raise OptionError("to_mesh: a half-space has no closed surface; expected solids of finite size")
 
     parts, colours = [], {}
     for solid in scene.solids:
         part = _manifold(solid, segments, solid)
         for cut in solid.cuts:
             part = part - _manifold(cut, segments, solid)
-        # One identity for all faces of a part, those of its cuts too, by which they are told apart in the union.
+        # One identity for all faces of a solid, including those of its cuts, to recognise them in the union.
         part = part.as_original()
         parts.append(part)
         colours[part.original_id()] = solid.material.colour
@@ -70,7 +70,7 @@ def to_mesh(scene: Scene, *, segments: int = 64) -> trimesh.Trimesh:
 
 
 def _manifold(solid: Solid, segments: int, part: Solid) -> Any:
-    """One solid without its cuts; a half-space as a box that covers its side of ``part``."""
+    """One primitive without cuts; a half-space as a box that covers its side of ``part``."""
     from manifold3d import Manifold
 
     if solid.kind is Kind.HALF_SPACE:
@@ -80,7 +80,7 @@ def _manifold(solid: Solid, segments: int, part: Solid) -> Any:
     elif solid.kind is Kind.SPHERE:
         shape = Manifold.sphere(1.0, segments)
     else:
-        # The library's round solids stand along z; ours along y, with the full radius at y = -1.
+        # The library's cylinders are along z; ours along y, with the full radius at y = -1.
         taper = solid.taper if solid.kind is Kind.CONE else 1.0
         shape = Manifold.cylinder(2.0, 1.0, taper, segments, True)
         shape = shape.transform(np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0]]))
@@ -88,11 +88,11 @@ def _manifold(solid: Solid, segments: int, part: Solid) -> Any:
 
 
 def _large_box(half_space: Solid, part: Solid) -> Solid:
-    """The box below a half-space's face that holds all of ``part`` on that side."""
+    """The box below a half-space's face that contains all of ``part`` on that side."""
     low, high = part.bounds()
     linear, point = half_space.world_from_local[:, :3], half_space.world_from_local[:, 3]
     local = np.linalg.solve(linear, ((low + high) / 2 - point)[:, None])[:, 0]
-    # The farthest that any point of the part lies from its middle, in local units along each axis.
+    # The largest distance of any point of the part from its centre, in local units along each axis.
     reach = np.abs(np.linalg.inv(linear)) @ (high - low) / 2
     sides, depth = 1.5 * reach, max(1.5 * reach[1] - local[1], reach[1])
     center = np.array([local[0], -depth / 2, local[2]])

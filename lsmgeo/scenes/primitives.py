@@ -1,4 +1,4 @@
-"""Solids that a ray meets in one interval: the parts of analytic scenes, as plain values on the host."""
+"""Convex primitives, and solids made of them by CSG subtraction: the parts of analytic scenes, as plain values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Vector = Sequence[float] | np.ndarray
 
 
 class Kind(IntEnum):
-    """The canonical convex solid in local coordinates (x, y, z) of which a part is an affine image."""
+    """The canonical convex primitives in local coordinates (x, y, z); solids are affine images of them."""
 
     HALF_SPACE = 0  # y <= 0
     SPHERE = 1  # x^2 + y^2 + z^2 <= 1
@@ -31,16 +31,16 @@ TEXTURES = ("plain", "stripes", "checker", "waves")
 
 @dataclass(frozen=True)
 class Material:
-    """The Lambertian colour of a part's surface: one colour, or a solid texture between two.
+    """The Lambertian colour of a solid's surface: one colour, or a solid texture between two.
 
-    A texture is a function of the world position, so neighbouring parts of one material join without a seam.
+    A texture is a function of the world position, so neighbouring solids of one material join without a seam.
 
     Attributes:
         colour: RGB in [0, 1].
         texture: "plain", "stripes" (soft bands), "checker" (cubes) or "waves" (six plane waves, band limited).
         second: the texture's other colour.
-        frequency: periods in a world unit.
-        seed: places and turns the texture.
+        frequency: periods per world unit.
+        seed: of the texture's position and rotation.
     """
 
     colour: tuple[float, float, float] = (0.7, 0.7, 0.7)
@@ -68,14 +68,14 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A convex solid, an affine image of a canonical one, less the solids cut out of it.
+    """A primitive, an affine image of a canonical one, minus other primitives (CSG subtraction).
 
     Attributes:
-        kind: which canonical solid.
+        kind: the canonical primitive.
         world_from_local: (3, 4) float64, invertible; it may scale, shear and mirror.
         taper: of a cone: its radius at the far end over that at the near end, in [0, 1].
-        material: how its surface looks, where it was cut too.
-        cuts: solids that are taken away from this one, and from no other; they have no cuts of their own.
+        material: the material of its surface, including the cut faces.
+        cuts: the primitives subtracted from this one, and from no other; they have no cuts themselves.
     """
 
     kind: Kind
@@ -94,12 +94,12 @@ class Solid:
         if not 0 <= self.taper <= 1:
             raise OptionError(f"Solid: taper must be in [0, 1]; got {self.taper!r}")
         if not all(isinstance(cut, Solid) and not cut.cuts for cut in self.cuts):
-            raise OptionError("Solid: what is cut out must be Solids with no cuts of their own")
+            raise OptionError("Solid: cuts must be Solids with no cuts of their own")
         matrix.setflags(write=False)
         object.__setattr__(self, "world_from_local", matrix)
 
     def transformed(self, matrix: Vector) -> Solid:
-        """The solid, with its cuts, moved by an affine (3, 4) or (4, 4) matrix."""
+        """The solid and its cuts, transformed by an affine (3, 4) or (4, 4) matrix."""
         matrix = np.asarray(matrix, dtype=np.float64)
         if matrix.shape not in ((3, 4), (4, 4)):
             raise OptionError(f"transformed: matrix must be affine, (3, 4) or (4, 4); got {matrix.shape}")
@@ -109,14 +109,14 @@ class Solid:
         return replace(self, world_from_local=linear, cuts=tuple(cut.transformed(matrix) for cut in self.cuts))
 
     def moved(self, offset: Vector) -> Solid:
-        """The solid shifted by (x, y, z)."""
+        """The solid translated by (x, y, z)."""
         return self.transformed(np.c_[np.eye(3), np.asarray(offset, dtype=np.float64)])
 
     def rotated(self, axis: int, degrees: float, center: Vector = (0.0, 0.0, 0.0)) -> Solid:
-        """The solid turned about a line through ``center`` along x, y or z (``axis`` 0, 1, 2), right-handed."""
-        turn = rotation(axis, degrees)
+        """The solid rotated about a line through ``center`` along x, y or z (``axis`` 0, 1, 2), right-handed."""
+        R = rotation(axis, degrees)
         center = np.asarray(center, dtype=np.float64)
-        return self.transformed(np.c_[turn, center - turn @ center])
+        return self.transformed(np.c_[R, center - R @ center])
 
     def scaled(self, factors: float | Vector, center: Vector = (0.0, 0.0, 0.0)) -> Solid:
         """The solid scaled along the coordinate axes from ``center``; a negative factor mirrors."""
@@ -129,7 +129,7 @@ class Solid:
         return self.scaled([-1.0 if index == axis else 1.0 for index in range(3)])
 
     def minus(self, *cuts: Solid) -> Solid:
-        """The solid less other convex solids."""
+        """The solid minus other primitives (CSG subtraction)."""
         return replace(self, cuts=self.cuts + cuts)
 
     def painted(self, material: Material) -> Solid:
@@ -137,7 +137,7 @@ class Solid:
         return replace(self, material=material)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest (x, y, z), exact before cuts; infinite for a half-space."""
+        """Lowest and highest (x, y, z), exact without cuts; infinite for a half-space."""
         linear, center = self.world_from_local[:, :3], self.world_from_local[:, 3]
         if self.kind is Kind.HALF_SPACE:
             return np.full(3, -np.inf), np.full(3, np.inf)
@@ -169,12 +169,12 @@ def sphere(center: Vector, radius: float, material: Material | None = None) -> S
 
 
 def ellipsoid(center: Vector, radii: Vector, material: Material | None = None) -> Solid:
-    """An ellipsoid with axes along x, y, z; turn it with `Solid.rotated`."""
+    """An ellipsoid with axes along x, y, z; rotate it with `Solid.rotated`."""
     return _placed(Kind.SPHERE, np.diag(_positive("ellipsoid", "radii", radii)), center, material)
 
 
 def box(center: Vector, size: Vector, material: Material | None = None) -> Solid:
-    """A box with edges of lengths ``size`` along x, y, z; turn it with `Solid.rotated`."""
+    """A box with edges of lengths ``size`` along x, y, z; rotate it with `Solid.rotated`."""
     return _placed(Kind.BOX, np.diag(_positive("box", "size", size)) / 2, center, material)
 
 
@@ -195,9 +195,9 @@ def cone(
 
 
 def half_space(point: Vector, normal: Vector, material: Material | None = None) -> Solid:
-    """All that lies on or below the plane through ``point``, on the side that ``normal`` points away from.
+    """The points on or below the plane through ``point``, on the side opposite to ``normal``.
 
-    As a part it is a floor or a wall; cut out of a solid, it clips.
+    In a scene it is a floor or a wall; subtracted from a solid, it clips.
     """
     normal = np.asarray(normal, dtype=np.float64)
     frame = _frame("half_space", "normal", normal / _length("half_space", normal))

@@ -1,4 +1,4 @@
-"""Pictures of analytic scenes: colour, exact depth, normals and silhouettes, for many scenes and views in one call."""
+"""Rendering of analytic scenes: colour, exact depth, normals and masks, for many scenes and views in one call."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lsmgeo.cameras.camera_checks import check_cameras, common_size
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
 from lsmgeo.cameras.tensors import Cameras
 from lsmgeo.errors import DTypeError, ShapeError
-from lsmgeo.scenes.inputs import behind, checked_lights
+from lsmgeo.scenes.inputs import background_array, checked_lights
 from lsmgeo.scenes.lighting import Lights, shade
 from lsmgeo.scenes.surfaces import albedo, normals
 from lsmgeo.scenes.tables import Scene, check_scenes
@@ -22,11 +22,11 @@ from lsmgeo.scenes.tracing import CameraRays, FreeRays, Plan, first_hits, make_p
 
 __all__ = ["Hits", "Rendering", "render", "trace"]
 
-# Shadow rays leave a surface from this far above it, as a fraction of its depth: scenes of any scale look alike.
+# Shadow rays start at this distance from the surface, relative to its depth: scenes of any scale look alike.
 SHADOW_OFFSET = 5e-5
-# And from so many roundings of its coordinates, for surfaces far from the origin.
+# Plus this many roundings of its coordinates, for surfaces far from the origin.
 SHADOW_ROUNDINGS = 16
-# Where views fit the caches, and solids are visited within windows; elsewhere many views go together.
+# Devices where one view fits into the caches, and solids are tested within windows; elsewhere views are batched.
 ONE_VIEW_AT_A_TIME = ("cpu",)
 VIEWS_AT_ONCE = 64
 
@@ -37,11 +37,11 @@ class Rendering(NamedTuple):
     images: Tensor  # (S, V, 3, H, W) RGB in [0, 1]
     depth: Tensor  # (S, V, H, W) camera z of the surface, 0 where there is none
     normals: Tensor  # (S, V, 3, H, W) unit, world frame, towards the camera's side; 0 where there is no surface
-    mask: Tensor  # (S, V, H, W) bool, True where a surface is seen
+    mask: Tensor  # (S, V, H, W) bool, True on surfaces
 
 
 class Hits(NamedTuple):
-    """Where N rays of S scenes first enter a solid."""
+    """The first hits of N rays in S scenes."""
 
     distance: Tensor  # (S, N) in multiples of the ray's direction, infinite where nothing is hit
     points: Tensor  # (S, N, 3) world; 0 where nothing is hit
@@ -64,15 +64,15 @@ def render(
     """Render analytic scenes: first hits in closed form at the pixel centres, shaded by `shade`.
 
     Convention:
-        Depth is camera z. Integer pixel centres. A solid that contains the camera is not seen from within.
+        Depth is camera z. Integer pixel centres. A solid that contains the camera is invisible.
 
     Args:
         scenes: S scenes.
-        cameras: leading shape (S, V), all images of one size; their device does the work.
+        cameras: leading shape (S, V), all images of one size; rendering runs on their device.
         lights: directions and colours (S, L, 3), ambient (S, 3); or without S, for all scenes.
-        background: RGB behind the surfaces, (3,), or anything that broadcasts to (S, V, 3, H, W).
+        background: RGB (3,), or any array that broadcasts to (S, V, 3, H, W).
         shadows: whether solids block the lights.
-        near: nothing is seen at or nearer than this depth, world units.
+        near: surfaces at or below this depth are invisible, world units.
         size: (H, W) of the images; by default the cameras' own. K is resized for it.
         dtype: float32 or float64, of the arithmetic and of the results; matrices are always composed in float64.
 
@@ -80,10 +80,10 @@ def render(
         `Rendering`. Not differentiable.
 
     Raises:
-        ShapeError: no scene, or shapes that do not belong together.
+        ShapeError: no scene, or inconsistent shapes.
         DTypeError: a dtype other than float32 and float64.
-        OptionError: something else than `Scene`; near not positive.
-        CameraError: bad cameras, or views of different sizes and no ``size``.
+        OptionError: not a sequence of `Scene`; near not positive.
+        CameraError: invalid cameras, or views of different sizes without ``size``.
 
     Example:
         >>> import torch
@@ -91,10 +91,10 @@ def render(
         >>> ball = scenes.Scene([scenes.sphere((0, 0, 0), 0.5)])
         >>> view = cameras.orbit(torch.zeros(1, 1), 0.0, 2.0, focal_length=60.0, height=33, width=33)
         >>> sun = scenes.Lights(torch.tensor([[1.0, 0.0, 0.0]]), torch.full((1, 3), 0.8), torch.full((3,), 0.2))
-        >>> picture = scenes.render([ball], view, sun)
-        >>> picture.depth[0, 0, 16, 16]
+        >>> rendering = scenes.render([ball], view, sun)
+        >>> rendering.depth[0, 0, 16, 16]
         tensor(1.5000)
-        >>> int(picture.mask.sum())
+        >>> int(rendering.mask.sum())
         749
     """
     who = "render"
@@ -108,7 +108,7 @@ def render(
             f"{who}: cameras must have the leading shape (S, V) with S = {len(scenes)} scenes; got {tensors.shape}"
         )
     if tensors.intrinsics.shape[1] == 0:
-        raise ShapeError(f"{who}: cameras must have one view at least; got V = 0")
+        raise ShapeError(f"{who}: cameras must have at least one view; got V = 0")
     check_cameras(who, tensors)
     size = common_size(who, tensors) if size is None else check_size(who, "size", size, 2, "(h, w)")  # type: ignore[assignment]
     assert size is not None
@@ -116,7 +116,7 @@ def render(
     device = tensors.intrinsics.device
     matrices = CameraMatrices(*(value.flatten(0, 1) for value in camera_matrices(tensors, size)))
     lights = checked_lights(who, lights, count, device, dtype)
-    images = behind(who, background, (count, per_scene, 3, *size), device, dtype)
+    images = background_array(who, background, (count, per_scene, 3, *size), device, dtype)
     depth = images.new_zeros((count, per_scene, *size))
     normal = torch.zeros_like(images)
     mask = torch.zeros_like(depth, dtype=torch.bool)
@@ -138,7 +138,7 @@ def render(
 
 
 def _blocks(count: int, views: int, device: torch.device) -> Iterator[tuple[slice, list[int], list[slice]]]:
-    """What is rendered together: scenes, the scene of each view within them, and slices of all views."""
+    """What is rendered together: scenes, the index of each view's scene among them, and slices of all views."""
     if device.type in ONE_VIEW_AT_A_TIME:
         for scene in range(count):
             yield slice(scene, scene + 1), [0], [slice(v, v + 1) for v in range(scene * views, (scene + 1) * views)]
@@ -167,39 +167,39 @@ def _render_views(
     shadows: bool,
     near: float,
 ) -> None:
-    """Render V views, view v of scene ``owner[v]``, into arrays that hold the background."""
+    """Render V views, view v of scene ``owner[v]``, over the background in the arrays."""
     dtype, device = out.depth.dtype, out.depth.device
     shape = (len(owner), out.depth.shape[1], out.depth.shape[2])
     rays = CameraRays(plan, cameras, shape[1:], near=near, dtype=dtype)
     nearest, surface = first_hits(plan, rays, shape, near, out.depth)
-    seen = surface >= 0
-    at = seen.flatten().nonzero()[:, 0]  # (K,)
+    mask = surface >= 0
+    at = mask.flatten().nonzero()[:, 0]  # (K,)
     rows, depth = surface.flatten()[at].long(), nearest.flatten()[at]
     view = at // (shape[1] * shape[2])
     pixel = torch.stack((at % shape[2], at // shape[2] % shape[1], torch.ones_like(at))).to(dtype)
 
     def each(values: Tensor) -> Tensor:
-        """What belongs to a view, for each of the K pixels; of one view, once."""
+        """The values of each of the K pixels' views; of a single view, only once."""
         return values if len(owner) == 1 else values[view]
 
     from_pixel = each(rays.from_pixel.to(dtype)).permute(1, 2, 0)  # (3, 3, K)
     points = each(cameras.center.to(dtype)).T + depth * (from_pixel * pixel).sum(1)  # (3, K)
-    solids = plan.tables.to(device, dtype)
-    normal = normals(solids, rows, points)
+    tables = plan.tables.to(device, dtype)
+    normal = normals(tables, rows, points)
     light = Lights(*(each(value[owner]) for value in lights))
     lit = None
     if shadows and lights.directions.shape[1]:
         rounding = SHADOW_ROUNDINGS * torch.finfo(dtype).eps * points.abs().amax(0)
         start = points + (SHADOW_OFFSET * depth + rounding) * normal
-        lit = _lit(plan._replace(tables=solids), owner, start, at, shape, lights)
-    _put(out.images, at, shade(albedo(solids, rows, points).T, normal.T, light, lit).T)
-    _put(out.normals, at, normal)
-    out.depth.copy_(torch.where(seen, nearest, 0.0))
-    out.mask.copy_(seen)
+        lit = _lit(plan._replace(tables=tables), owner, start, at, shape, lights)
+    _scatter(out.images, at, shade(albedo(tables, rows, points).T, normal.T, light, lit).T)
+    _scatter(out.normals, at, normal)
+    out.depth.copy_(torch.where(mask, nearest, 0.0))
+    out.mask.copy_(mask)
 
 
-def _put(target: Tensor, at: Tensor, values: Tensor) -> None:
-    """Write values (3, K) at pixels ``at`` (K,), counted over all views, of a contiguous target (V, 3, H, W)."""
+def _scatter(target: Tensor, at: Tensor, values: Tensor) -> None:
+    """Write values (3, K) at pixels ``at`` (K,), indices over all views, of a contiguous target (V, 3, H, W)."""
     count = target.shape[2] * target.shape[3]
     first = at + (at // count) * (2 * count)
     for channel, value in enumerate(values):
@@ -209,40 +209,40 @@ def _put(target: Tensor, at: Tensor, values: Tensor) -> None:
 def _lit(
     plan: Plan, owner: list[int], start: Tensor, at: Tensor, shape: tuple[int, int, int], lights: Lights
 ) -> Tensor:
-    """Whether points (3, K), at pixels ``at`` of V views, see each light: (K, L) bool."""
-    alone = len(owner) == 1
-    if alone:
+    """Whether points (3, K), at pixels ``at`` of V views, are lit by each light: (K, L) bool."""
+    single = len(owner) == 1
+    if single:
         origins = start[None, :, None]  # (1, 3, 1, K)
     else:
         origins = start.new_zeros(shape[0], 3, *shape[1:])
-        _put(origins, at, start)
+        _scatter(origins, at, start)
     columns = []
     for light in range(lights.directions.shape[1]):
         towards = lights.directions[owner, light, :, None, None].expand_as(origins)
         rays = FreeRays(plan, origins, towards)
         nearest, _ = first_hits(plan, rays, (len(owner), *origins.shape[2:]), 0.0, start)
         free = nearest.isinf().flatten()
-        columns.append(free if alone else free[at])
+        columns.append(free if single else free[at])
     return torch.stack(columns, -1)
 
 
 @torch.no_grad()
 def trace(scenes: Sequence[Scene], origins: Tensor, directions: Tensor, *, near: float = 1e-6) -> Hits:
-    """Where rays first enter a solid, in closed form.
+    """The first hits of rays, in closed form.
 
     Args:
         scenes: S scenes.
         origins: (S, N, 3) world, float32 or float64.
         directions: (S, N, 3) of any length above 0, of the same dtype.
-        near: nothing is hit at or nearer than this multiple of the direction.
+        near: hits at or below this multiple of the direction are ignored.
 
     Returns:
-        `Hits`. A solid that contains a ray's origin is not seen from within. Not differentiable.
+        `Hits`. A solid that contains a ray's origin is ignored. Not differentiable.
 
     Raises:
         ShapeError: shapes other than (S, N, 3).
-        DTypeError: tensors of another dtype, or of two.
-        OptionError: something else than `Scene`; near not positive.
+        DTypeError: tensors of another dtype, or of two dtypes.
+        OptionError: not a sequence of `Scene`; near not positive.
 
     Example:
         >>> import torch

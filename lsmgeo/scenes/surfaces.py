@@ -1,4 +1,4 @@
-"""What a surface is like at given points of it: its normal and its colour. Arrays run (3, K), one row a coordinate."""
+"""Normals and colours at points of surfaces. Arrays are (3, K), one row per coordinate."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ __all__ = ["albedo", "normals"]
 TINY = 1e-30
 
 
-def normals(solids: Tables, rows: Tensor, points: Tensor) -> Tensor:
-    """Unit normals, out of the solid (and into what was cut out), of points on the surfaces of solids.
+def normals(tables: Tables, rows: Tensor, points: Tensor) -> Tensor:
+    """Unit normals at points on the surfaces of primitives, outward (inward for subtracted ones).
 
-    The face is the one of whose function (see `Tables`) the value is largest, that is nearest to 0.
+    The face is the one whose function (see `Tables`) has the largest value, that is, nearest to 0.
 
     Args:
-        solids: in the points' dtype.
-        rows: (K,) which solid.
+        tables: in the points' dtype.
+        rows: (K,) the primitive.
         points: (3, K), world.
 
     Returns:
         (3, K), world.
     """
     columns = (
-        solids.linear.flatten(1),  # 0:9
-        solids.center,  # 9:12
-        solids.low,  # 12:15
-        solids.high,  # 15:18
-        solids.round,  # 18:21
-        torch.stack((solids.radius, solids.slope, solids.side), 1),  # 21:24
+        tables.linear.flatten(1),  # 0:9
+        tables.center,  # 9:12
+        tables.low,  # 12:15
+        tables.high,  # 15:18
+        tables.round,  # 18:21
+        torch.stack((tables.radius, tables.slope, tables.side), 1),  # 21:24
     )
     numbers = torch.cat(columns, 1).T.contiguous().index_select(1, rows)  # (24, K)
     linear = numbers[:9].unflatten(0, (3, 3))
@@ -47,22 +47,22 @@ def normals(solids: Tables, rows: Tensor, points: Tensor) -> Tensor:
     facet = torch.where(axis == torch.arange(3, device=axis.device)[:, None], sign, 0.0)
     gradient = curved * local / radial.clamp_min(TINY)
     gradient[1] -= slope
-    local_normal = torch.where(is_round, gradient, facet)  # a covector: it goes with the transpose
+    local_normal = torch.where(is_round, gradient, facet)  # a covector: transformed by the transpose
     normal = (linear * local_normal[:, None]).sum(0)
     return normal * (side / normal.square().sum(0).sqrt().clamp_min(TINY))
 
 
-def albedo(solids: Tables, rows: Tensor, points: Tensor) -> Tensor:
-    """RGB (3, K) of points (3, K), world, on the surfaces of solids ``rows`` (K,)."""
-    colours = solids.colour.flatten(1).T.contiguous().index_select(1, rows)  # (6, K)
+def albedo(tables: Tables, rows: Tensor, points: Tensor) -> Tensor:
+    """RGB (3, K) of points (3, K), world, on the surfaces of primitives ``rows`` (K,)."""
+    colours = tables.colour.flatten(1).T.contiguous().index_select(1, rows)  # (6, K)
     colour, second = colours[:3], colours[3:]
-    at = solids.textured[rows].nonzero()[:, 0]
+    at = tables.textured[rows].nonzero()[:, 0]
     if len(at) == 0:
         return colour
     row, point = rows[at], points[:, at]
-    waves = torch.sin((solids.waves[row] * point.T[:, None]).sum(-1) + solids.phase[row])  # (K', 6)
-    soft = (0.5 + (solids.weight[row] * waves).sum(-1)).clamp(0, 1)
+    waves = torch.sin((tables.waves[row] * point.T[:, None]).sum(-1) + tables.phase[row])  # (K', 6)
+    soft = (0.5 + (tables.weight[row] * waves).sum(-1)).clamp(0, 1)
     cubes = (waves[:, :3] > 0).sum(-1).remainder(2).to(soft.dtype)
-    mix = torch.where(solids.checker[row], cubes, soft)
+    mix = torch.where(tables.checker[row], cubes, soft)
     colour[:, at] = torch.lerp(second[:, at], colour[:, at], mix)
     return colour

@@ -1,4 +1,4 @@
-"""Scenes, and the numbers of their solids side by side in tensors."""
+"""Scenes, and the numbers of their primitives as rows of tensors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WAVES = 6
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The union of solids, each less what was cut out of it.
+    """The union of solids.
 
     Attributes:
         solids: at least one `Solid`.
@@ -37,23 +37,23 @@ class Scene:
     def __init__(self, solids: Sequence[Solid]) -> None:
         solids = tuple(solids)
         if not solids or not all(isinstance(solid, Solid) for solid in solids):
-            raise OptionError(f"Scene: solids must be Solids, one at least; got {solids!r:.80}")
+            raise OptionError(f"Scene: solids must be at least one Solid; got {solids!r:.80}")
         object.__setattr__(self, "solids", solids)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest (x, y, z) of the solids before cuts."""
+        """Lowest and highest (x, y, z) of the solids without cuts."""
         lower, upper = zip(*(solid.bounds() for solid in self.solids), strict=True)
         return np.min(lower, 0), np.max(upper, 0)
 
     def transformed(self, matrix: np.ndarray) -> Scene:
-        """The scene moved by an affine (3, 4) or (4, 4) matrix."""
+        """The scene transformed by an affine (3, 4) or (4, 4) matrix."""
         return Scene([solid.transformed(matrix) for solid in self.solids])
 
 
 class Tables(NamedTuple):
-    """N solids, cuts among them, as rows; float64.
+    """N primitives, including those subtracted, as rows; float64.
 
-    The surface of a solid is where the largest of these functions of the local point is 0: ``x - high`` and
+    The surface of a primitive is where the largest of these functions of the local point is 0: ``x - high`` and
     ``low - x`` on each axis, and ``sqrt(round . x^2) - (radius + slope y)``.
     """
 
@@ -67,7 +67,7 @@ class Tables(NamedTuple):
     radius: Tensor  # (N,)
     slope: Tensor  # (N,)
     taper: Tensor  # (N,)
-    side: Tensor  # (N,), -1 for what is cut out: its surface is seen from within
+    side: Tensor  # (N,), -1 for subtracted primitives, whose surface is visible from inside
     colour: Tensor  # (N, 2, 3)
     textured: Tensor  # (N,) bool
     checker: Tensor  # (N,) bool
@@ -84,7 +84,7 @@ class Tables(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """Where a solid and its cuts lie in the tables."""
+    """The rows of a solid and its cuts in the tables."""
 
     kind: Kind
     row: int
@@ -104,11 +104,11 @@ def check_scenes(who: str, scenes: Sequence[Scene]) -> tuple[Scene, ...]:
     if not all(isinstance(scene, Scene) for scene in scenes):
         raise OptionError(f"{who}: scenes must be a sequence of Scene; got {scenes!r:.80}")
     if not scenes:
-        raise ShapeError(f"{who}: scenes must hold one Scene at least; got none")
+        raise ShapeError(f"{who}: scenes must hold at least one Scene; got none")
     return scenes
 
 
-# Of canonical solids: low, high, round, radius; a cone's radius and slope follow from its taper.
+# Of canonical primitives: low, high, round, radius; a cone's radius and slope follow from its taper.
 INF = float("inf")
 CANONICAL = {
     Kind.HALF_SPACE: ((-INF,) * 3, (INF, 0.0, INF), (0.0,) * 3, INF),
@@ -120,22 +120,22 @@ CANONICAL = {
 
 
 def layout(scenes: Sequence[Scene]) -> tuple[Tables, list[list[Placed]]]:
-    """The solids and cuts of scenes as rows of one table, and where they lie in it: a list for each scene."""
-    solids: list[Solid] = []
+    """The primitives of scenes as rows of one table, and a list for each scene with the rows of its solids."""
+    primitives: list[Solid] = []
     sides: list[float] = []
     materials: list[Material] = []
     placed = []
     for scene in scenes:
         entries = []
         for solid in scene.solids:
-            first = len(solids)
+            first = len(primitives)
             cuts = tuple((cut.kind, first + 1 + index) for index, cut in enumerate(solid.cuts))
             entries.append(Placed(solid.kind, first, cuts))
-            solids += (solid, *solid.cuts)
+            primitives += (solid, *solid.cuts)
             sides += [1.0] + [-1.0] * len(cuts)
             materials += [solid.material] * (1 + len(cuts))
         placed.append(entries)
-    return _tables(solids, sides, materials), placed
+    return _tables(primitives, sides, materials), placed
 
 
 def _tables(solids: Sequence[Solid], sides: Sequence[float], materials: Sequence[Material]) -> Tables:
@@ -176,10 +176,10 @@ def _texture(material: Material) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if material.texture == "stripes":
         return waves, phase, np.eye(WAVES)[0] / 2
     if material.texture == "waves":
-        # Frequencies from half of the stated one up to it; the sum leaves [-1/2, 1/2] seldom, and is clamped there.
+        # Frequencies from half of the stated one up to it; the sum is seldom outside [-1/2, 1/2], and clamped.
         return waves * np.linspace(0.5, 1, WAVES)[:, None], phase, np.full(WAVES, 0.5 / np.sqrt(WAVES))
     if material.texture == "checker":
-        # Half a period is the edge of a cube; three orthogonal waves, whose signs multiply.
+        # The product of the signs of three orthogonal waves; half a period is the edge of a cube.
         basis = np.linalg.qr(directions[:3].T)[0].T
         return np.r_[2 * np.pi * material.frequency * basis, np.zeros((WAVES - 3, 3))], phase, np.zeros(WAVES)
     return np.zeros((WAVES, 3)), np.zeros(WAVES), np.zeros(WAVES)

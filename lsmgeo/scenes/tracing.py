@@ -1,7 +1,7 @@
-"""First hits of rays with scenes: which solid's surface, and where.
+"""First hits of rays with scenes: the surface, and the ray parameter.
 
-Every solid, and every cut, gives one interval of the ray; a cut moves the start of its solid's interval to its own end.
-The nearest start wins. A view alone visits each solid within the pixels that can show it; many views together visit
+Every primitive gives one interval of the ray; a subtracted one moves the start of its solid's interval to its own end.
+The nearest start is the hit. A single view tests each solid only in the pixels that can show it; batched views test all
 their solids of one kind at once.
 """
 
@@ -23,20 +23,20 @@ __all__ = ["CameraRays", "FreeRays", "Plan", "first_hits", "make_plan"]
 
 Window = tuple[slice, slice]
 EVERYTHING = (slice(None), slice(None))
-# Surfaces nearer to each other than so many roundings of the ray parameter are taken to coincide, at cuts.
+# At cuts, surfaces closer than this many roundings of the ray parameter coincide.
 ROUNDINGS = 16
 
 
 class Visit(NamedTuple):
-    """Solids of one kind that are intersected together, at most one of a view."""
+    """Solids of one kind that are intersected together, at most one per view."""
 
     kind: Kind
     rows: list[int]  # (M,) rows of the plan's tables, one for each view of `views`
     views: list[int]  # (M,)
-    cuts: list[tuple[Kind, list[int], list[int]]]  # of each cut: kind, which of the M have it, their rows
+    cuts: list[tuple[Kind, list[int], list[int]]]  # of each cut: kind, which of the M have it, and its rows
 
     def pairs(self) -> list[tuple[int, int]]:
-        """(row, view) of all that is intersected."""
+        """(row, view) of all primitives that are intersected."""
         cut = [
             (row, self.views[member]) for _, which, rows in self.cuts for member, row in zip(which, rows, strict=True)
         ]
@@ -44,14 +44,14 @@ class Visit(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """The solids of V views of scenes. A row of the tables is one solid, or cut, of one scene."""
+    """The solids of V views of scenes. A row of the tables is one primitive of one scene."""
 
     tables: Tables
     visits: list[Visit]
 
 
 def make_plan(scenes: Sequence[Scene], owner: Sequence[int], device: torch.device) -> Plan:
-    """Lay out which solids are intersected with which views, and in what company.
+    """Group the solids that are intersected together.
 
     Args:
         scenes: S scenes.
@@ -62,14 +62,14 @@ def make_plan(scenes: Sequence[Scene], owner: Sequence[int], device: torch.devic
     # The first solid of a kind in every view, then the second, and so on.
     grouped: dict[tuple[Kind, int], list[tuple[int, Placed]]] = {}
     for view, scene_index in enumerate(owner):
-        seen: dict[Kind, int] = {}
+        counts: dict[Kind, int] = {}
         for entry in placed[scene_index]:
-            seen[entry.kind] = seen.get(entry.kind, 0) + 1
-            grouped.setdefault((entry.kind, seen[entry.kind]), []).append((view, entry))
+            counts[entry.kind] = counts.get(entry.kind, 0) + 1
+            grouped.setdefault((entry.kind, counts[entry.kind]), []).append((view, entry))
 
     visits = []
     for (kind, _), members in grouped.items():
-        # Cuts of the same kind and place in their solid's list go together.
+        # Cuts of the same kind and index in their solid's list are grouped.
         cut: dict[tuple[int, Kind], tuple[list[int], list[int]]] = {}
         for member, (_, entry) in enumerate(members):
             for place, (cut_kind, row) in enumerate(entry.cuts):
@@ -84,14 +84,14 @@ def make_plan(scenes: Sequence[Scene], owner: Sequence[int], device: torch.devic
 class CameraRays:
     """The rays through the pixel centres of V cameras, parametrised by depth.
 
-    The local point of pixel (u, v) at depth t is affine in u and in v: one row and one column of numbers a solid, taken
-    where the solid's centre is, so that nothing large cancels.
+    The local point of pixel (u, v) at depth t is affine in u and in v: one row and one column of numbers per primitive,
+    at the depth of its centre to avoid cancellation.
 
     Args:
         plan: of the V views.
         cameras: float64 matrices of the V cameras, for images of this size.
         size: (H, W).
-        near: nothing nearer is seen.
+        near: surfaces below this depth are invisible.
         dtype: of the arithmetic.
     """
 
@@ -109,8 +109,8 @@ class CameraRays:
         device = cameras.intrinsics.device
         rows, views = torch.tensor(pairs, device=device).unbind(1)
         self.from_pixel = cameras.world_from_pixel()
-        solids = plan.tables
-        linear, offset = solids.linear[rows], cameras.center[views] - solids.center[rows]
+        tables = plan.tables
+        linear, offset = tables.linear[rows], cameras.center[views] - tables.center[rows]
         depth = (-(offset * cameras.rotation[views, 2]).sum(-1)).clamp_min(near)
         direction = multiply(linear, self.from_pixel[views])  # (P, 3, 3): applied to (u, v, 1)
         point = direction * depth[:, None, None]
@@ -124,9 +124,9 @@ class CameraRays:
 
         self.points, self.directions = separate(point), separate(direction)
         self.depth = depth[:, None, None].to(dtype)
-        # A view alone need not look at pixels that a solid cannot reach.
-        alone = len(cameras.center) == 1
-        self.windows = _windows(solids, rows, cameras, views, size, near) if alone else None
+        # A single view skips pixels that a solid cannot cover.
+        single = len(cameras.center) == 1
+        self.windows = _windows(tables, rows, cameras, views, size, near) if single else None
 
     def local(self, rows: list[int], views: list[int], window: Window) -> tuple[Tensor, Tensor, Tensor]:
         """Local points and directions (M, 3, h, w) of a window's rays, and the ray parameter of the points."""
@@ -138,7 +138,7 @@ class CameraRays:
         return point, direction, self.depth[which]
 
     def window(self, row: int, view: int) -> Window | None:
-        """Where a solid can be hit; None if nowhere."""
+        """The pixels where a solid can be hit; None without any."""
         if self.windows is None:
             return EVERYTHING
         top, bottom, left, right = self.windows[self.index[row, view]]
@@ -146,26 +146,26 @@ class CameraRays:
 
 
 def _windows(
-    solids: Tables, rows: Tensor, cameras: CameraMatrices, views: Tensor, size: tuple[int, int], near: float
+    tables: Tables, rows: Tensor, cameras: CameraMatrices, views: Tensor, size: tuple[int, int], near: float
 ) -> list[list[int]]:
-    """First and last + 1 row and column of the pixels that can show a solid, from the corners of its box."""
+    """First and last + 1 row and column of the pixels that can show a primitive, from the corners of its box."""
     corners = torch.cartesian_prod(*[rows.new_tensor([-1.0, 1.0], dtype=torch.float64)] * 3)  # (8, 3)
-    world = transform(solids.axes[rows, None], corners) + solids.center[rows, None]  # (P, 8, 3)
+    world = transform(tables.axes[rows, None], corners) + tables.center[rows, None]  # (P, 8, 3)
     homogeneous = CameraMatrices(*(value[views] for value in cameras)).homogeneous_pixels(world)
     depth = homogeneous[..., 2]
     pixel = homogeneous[..., :2] / depth.clamp_min(near)[..., None]
     limit = pixel.new_tensor([size[1], size[0]])
-    # One pixel of margin for rounding; what reaches behind the near plane may be anywhere.
+    # One pixel of margin for rounding; behind the near plane the projection is unbounded.
     first = (pixel.amin(1).floor() - 1).clamp_min(0).minimum(limit)
     last = (pixel.amax(1).ceil() + 2).clamp_min(0).minimum(limit)
-    bounded = [kind is not Kind.HALF_SPACE for kind in solids.kinds]
+    bounded = [kind is not Kind.HALF_SPACE for kind in tables.kinds]
     whole = ~(rows.new_tensor(bounded, dtype=torch.bool)[rows] & (depth > near).all(1))[:, None]
     first, last = torch.where(whole, 0.0, first).long(), torch.where(whole, limit, last).long()
     return torch.stack((first[:, 1], last[:, 1], first[:, 0], last[:, 0]), 1).tolist()
 
 
 class FreeRays:
-    """Rays from any point in any direction, parametrised by multiples of the direction.
+    """Rays from any point in any direction; the parameter is a multiple of the direction.
 
     Args:
         plan: of V views; its tables in the rays' dtype.
@@ -174,15 +174,15 @@ class FreeRays:
     """
 
     def __init__(self, plan: Plan, origins: Tensor, directions: Tensor) -> None:
-        self.solids, self.origins, self.directions = plan.tables, origins, directions
+        self.tables, self.origins, self.directions = plan.tables, origins, directions
         self.squared_length = directions.square().sum(1)
 
     def local(self, rows: list[int], views: list[int], window: Window) -> tuple[Tensor, Tensor, Tensor]:
         """As `CameraRays.local`; the window is all rays."""
-        linear, center = self.solids.linear[rows], self.solids.center[rows]
+        linear, center = self.tables.linear[rows], self.tables.center[rows]
         direction = self.directions[views]
         offset = self.origins[views] - center[:, :, None, None]
-        # From the point nearest to the solid's centre, so that nothing large cancels.
+        # From the point nearest to the solid's centre, to avoid cancellation.
         along = -(offset * direction).sum(1) / self.squared_length[views]  # (M, H, W)
         point = offset + along[:, None] * direction
         return _apply(linear, point), _apply(linear, direction), along
@@ -204,7 +204,7 @@ def first_hits(
 ) -> tuple[Tensor, Tensor]:
     """The nearest surface that each ray enters beyond ``near``.
 
-    A solid that holds the point at ``near`` is not seen from within, unless that point lies in one of its cuts.
+    A solid that contains the point at ``near`` is ignored, unless that point lies in one of its cuts.
 
     Args:
         plan: of V views.
@@ -233,13 +233,13 @@ def first_hits(
 
 
 def _enter(
-    solids: Tables, visit: Visit, rays: CameraRays | FreeRays, window: Window, near: float, dtype: torch.dtype
+    tables: Tables, visit: Visit, rays: CameraRays | FreeRays, window: Window, near: float, dtype: torch.dtype
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Start and end of the rays' first stretch inside solids less their cuts, and the row whose surface begins it."""
+    """Start and end of the rays' first interval inside solids minus their cuts, and the row of the surface hit."""
 
     def intervals(kind: Kind, rows: list[int], views: list[int]) -> tuple[Tensor, Tensor, Tensor]:
         point, direction, at = rays.local(rows, views, window)
-        taper = solids.taper[rows, None, None].to(dtype) if kind is Kind.CONE else 1.0
+        taper = tables.taper[rows, None, None].to(dtype) if kind is Kind.CONE else 1.0
         start, end = interval(kind, point, direction, taper)
         return start + at, end + at, at
 
@@ -249,16 +249,16 @@ def _enter(
         return start, end, who
     start = start.clamp_min(near)
     who = who.expand(start.shape).clone()
-    # Faces that are meant to coincide, of a cut and its solid or of two cuts, differ by rounding: no sliver is left.
+    # Faces that should coincide, of a cut and its solid or of two cuts, differ by rounding: avoid slivers.
     rounding = ROUNDINGS * torch.finfo(dtype).eps
-    gone = []
+    cuts = []
     for kind, which, rows in visit.cuts:
         row = torch.tensor(rows, dtype=torch.int32, device=start.device)[:, None, None]
         from_here, to_here, there = intervals(kind, rows, [visit.views[member] for member in which])
-        gone.append((which, row, from_here, to_here, there.abs()))
-    # A cut may lead into another: as many rounds as there are cuts settle it.
-    for _ in gone:
-        for which, row, from_here, to_here, there in gone:
+        cuts.append((which, row, from_here, to_here, there.abs()))
+    # A cut may end inside another one: as many rounds as there are cuts suffice.
+    for _ in cuts:
+        for which, row, from_here, to_here, there in cuts:
             begin = start[which]
             inside = (from_here - rounding * (begin.abs() + there) <= begin) & (begin < to_here)
             start[which] = torch.where(inside, to_here, begin)

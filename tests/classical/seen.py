@@ -10,7 +10,7 @@ import torch
 
 from lsmgeo.cameras import CameraTensors
 from tests import oracle
-from tests.oracle.solids import Part, first_hit
+from tests.oracle.primitives import Part, first_hit
 
 Array = npt.NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from lsmgeo.errors import CameraError, DTypeError, GridError, OptionError, Shape
 from tests import oracle
 from tests.classical.scored import to_box, to_ellipsoid
 from tests.classical.seen import Cameras, all_round, is_closed, volume
-from tests.oracle.solids import Ellipsoid, Faces, Part
+from tests.oracle.primitives import Ellipsoid, Faces, Part
 
 RADII = np.array([0.41, 0.27, 0.34])
 TURN = oracle.rotation(np.array([0.4, -0.7, 0.5]))

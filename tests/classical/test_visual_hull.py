@@ -14,7 +14,7 @@ from lsmgeo.classical import default_grid, extract_mesh, hull_box, signed_distan
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
 from tests import oracle
 from tests.classical.seen import Cameras, all_round, is_closed
-from tests.oracle.solids import Ellipsoid, Faces, Part, holds
+from tests.oracle.primitives import Ellipsoid, Faces, Part, holds
 
 RADII = np.array([0.42, 0.2, 0.3])
 TURN = oracle.rotation(np.array([0.4, -0.7, 0.5]))

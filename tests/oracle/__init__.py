@@ -1,7 +1,7 @@
-"""Closed forms in NumPy float64 that share no code with the library: the values the tests call ``expected``.
+"""Closed forms in NumPy float64, independent of the library: the values that tests call ``expected``.
 
-Nothing here imports the library or PyTorch. Every function works on one view or one ray bundle with the obvious
-formula; :mod:`tests.oracle.operators` loops over scenes and views.
+Nothing here imports the library or PyTorch. Every function is the textbook formula for one view or one
+ray bundle; :mod:`tests.oracle.operators` loops over scenes and views.
 """
 
 from tests.oracle.operators import plane_sweep, unproject, view_statistics

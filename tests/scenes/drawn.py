@@ -1,4 +1,4 @@
-"""Random scenes in two forms: the library's, and the oracle's, made from the same numbers."""
+"""Random scenes for the library and for the oracle, made from the same numbers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from lsmgeo import scenes
 from lsmgeo.cameras import CameraTensors
 from tests import oracle
-from tests.oracle import solids as truth
+from tests.oracle import primitives as truth
 
 KINDS = ("half_space", "sphere", "ellipsoid", "box", "sheared", "cylinder", "cone", "pointed")
 
@@ -37,7 +37,7 @@ class Drawn:
 
 def make(kind: str, rng: np.random.Generator, up: np.ndarray, scale: float) -> tuple[scenes.Solid, truth.Shape]:
     """A solid near the origin, and the same for the oracle; a half-space faces ``up``, more or less."""
-    center, turn = rng.uniform(-0.4, 0.4, 3), oracle.rotation(rng.normal(size=3) * 2)
+    center, rotation = rng.uniform(-0.4, 0.4, 3), oracle.rotation(rng.normal(size=3) * 2)
     size = rng.uniform(0.15, 0.6, 3) * scale
     if kind == "half_space":
         normal = up + rng.normal(size=3) * 0.2
@@ -45,14 +45,14 @@ def make(kind: str, rng: np.random.Generator, up: np.ndarray, scale: float) -> t
     if kind == "sphere":
         return scenes.sphere(center, size[0]), truth.Ellipsoid(center, np.full(3, size[0]), np.eye(3))
     if kind in ("ellipsoid", "box", "sheared"):
-        matrix = np.c_[turn, center]
+        matrix = np.c_[rotation, center]
         if kind == "ellipsoid":
-            return scenes.ellipsoid((0, 0, 0), size).transformed(matrix), truth.Ellipsoid(center, size, turn)
+            return scenes.ellipsoid((0, 0, 0), size).transformed(matrix), truth.Ellipsoid(center, size, rotation)
         if kind == "sheared":
             matrix[:, 1] += 0.7 * matrix[:, 0]
         edges = (matrix[:, :3] * size).T
         return scenes.box((0, 0, 0), size).transformed(matrix), truth.Faces(center - edges.sum(0) / 2, edges)
-    start, end = center, center + turn[:, 0] * size[0] * 2
+    start, end = center, center + rotation[:, 0] * size[0] * 2
     radii = {"cylinder": (size[1], size[1]), "cone": (size[1], size[2]), "pointed": (size[1], 0.0)}[kind]
     shape = truth.Frustum(start, end, *radii)
     if kind == "cylinder":
@@ -60,11 +60,11 @@ def make(kind: str, rng: np.random.Generator, up: np.ndarray, scale: float) -> t
     return scenes.cone(start, end, *radii), shape
 
 
-Names = list[tuple[str, list[str]]]  # of each solid: its kind, and the kinds of what is cut out of it
+Names = list[tuple[str, list[str]]]  # of each solid: its kind, and the kinds of its cuts
 
 
 def build(names: Names, seed: int, size: tuple[int, int] = (15, 20)) -> Drawn | None:
-    """A scene of these kinds, seen from two random cameras with skew; None if a solid would hold a camera."""
+    """A scene of these kinds, seen from two random cameras with skew; None if a solid would contain a camera."""
     rng = np.random.default_rng(seed)
     up = rng.normal(size=3)
     up /= np.linalg.norm(up)

@@ -1,4 +1,4 @@
-"""The comparison with the oracle can fail: each of these faults, put into the source, is noticed."""
+"""The comparison with the oracle can fail: each of these faults in the source is noticed."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import torch
 
 from lsmgeo import VoxelGrid, scenes
 from lsmgeo.scenes import inside, intervals, rendering, surfaces, tracing
-from tests.oracle import solids as truth
+from tests.oracle import primitives as truth
 from tests.scenes.drawn import KINDS, Drawn, build
 from tests.scenes.test_tracing import SUN, compare
 
 MODULES = (intervals, surfaces, tracing, inside, rendering)
 
-# What is wrong: (module, sound source, faulty source)
+# Fault: (module, correct source, faulty source)
 FAULTS = {
     "a radius off by a thousandth": (intervals, "- a * c\n    root", "- 1.001 * a * c\n    root"),
     "the wrong nappe of a cone": (intervals, "steep & (change > 0)", "steep & (change < 0)"),
@@ -28,24 +28,24 @@ FAULTS = {
         "return middle - reach, middle + 9",
     ),
     "a cone's slope in the normal": (surfaces, "gradient[1] -= slope", "gradient[1] += slope"),
-    "normals of cuts not turned": (surfaces, "normal * (side /", "normal * (1.0 /"),
+    "normals of cuts not inverted": (surfaces, "normal * (side /", "normal * (1.0 /"),
     "normals not by the transpose": (
         surfaces,
         "(linear * local_normal[:, None]).sum(0)",
         "(linear * local_normal).sum(1)",
     ),
-    "one round of cuts": (tracing, "for _ in gone:", "for _ in gone[:1]:"),
+    "one round of cuts": (tracing, "for _ in cuts:", "for _ in cuts[:1]:"),
     "the farthest hit": (tracing, "closer &= start < before", "closer &= (start > before) | before.isinf()"),
     "windows too small": (tracing, "ceil() + 2)", "ceil() - 1)"),
     "half a pixel": (tracing, "count, dtype=torch.float64, device=device)", "count, dtype=torch.float64) + 0.5"),
-    "another depth": (rendering, "torch.where(seen, nearest, 0.0)", "torch.where(seen, 1.01 * nearest, 0.0)"),
-    "cuts filled": (inside, "held &= ~_holds", "held |= _holds"),
+    "another depth": (rendering, "torch.where(mask, nearest, 0.0)", "torch.where(mask, 1.01 * nearest, 0.0)"),
+    "cuts filled": (inside, "inside &= ~_contains", "inside |= _contains"),
     "the grid's axes swapped": (inside, "inside[z, y, x] |=", "inside[z, x, y] |="),
 }
 
 
 def some() -> list[Drawn]:
-    """Scenes of two solids with cuts; together they hold every kind, as a solid and as a cut."""
+    """Scenes of two solids with cuts; together they have every kind, as a solid and as a cut."""
     found: list[Drawn] = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -70,7 +70,7 @@ def examine(several: list[Drawn]) -> None:
 
 
 def plant(patch: pytest.MonkeyPatch, module: types.ModuleType, sound: str, faulty: str) -> None:
-    """Replace a module's functions by those of its source with a fault in it, wherever they were imported."""
+    """Replace a module's functions, wherever they were imported, by those of its faulty source."""
     source = inspect.getsource(module)
     assert sound in source, "the source has changed: name the fault anew"
     broken = types.ModuleType(module.__name__)
@@ -88,7 +88,7 @@ def several() -> list[Drawn]:
     return some()
 
 
-def test_the_sound_source_passes(several):
+def test_the_correct_source_passes(several):
     examine(several)
 
 

@@ -1,4 +1,4 @@
-"""Meshes of analytic scenes: closed, of the right volume, and solid where the scene is."""
+"""Meshes of analytic scenes: closed, of the correct volume, and with the scene's occupancy."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ SHEAR = np.array([[1.0, 0.4, 0.0, 0.1], [0.0, 2.0, 0.3, -0.2], [0.2, 0.0, 0.7, 0
 
 
 def polygon(segments):
-    """The area of a regular polygon over that of its circle."""
+    """The area of a regular polygon relative to its circle."""
     angle = 2 * np.pi / segments
     return np.sin(angle) / angle
 
@@ -85,7 +85,7 @@ def test_parts_that_overlap_are_counted_once():
     np.testing.assert_allclose(mesh.volume, 6.0, rtol=1e-9)
 
 
-def test_a_cut_spares_the_other_parts():
+def test_a_cut_does_not_change_other_parts():
     hollow = box((0, 0, 0), (1, 1, 1)).minus(box((0, 0, 0), (0.8, 0.8, 0.8)))
     mesh = to_mesh(Scene([hollow, box((0, 0, 0), (0.5, 0.5, 0.5))]))
     np.testing.assert_allclose(mesh.volume, 1 - 0.8**3 + 0.5**3, rtol=1e-9)
@@ -99,7 +99,7 @@ def test_faces_have_the_colours_of_their_parts():
     first = mesh.triangles_center[:, 0] < 2
     np.testing.assert_array_equal(np.unique(colours[first], axis=0), [[255, 0, 0, 255]])
     np.testing.assert_array_equal(np.unique(colours[~first], axis=0), [[0, 0, 255, 255]])
-    # The walls of the hole belong to the part that it was cut from.
+    # The walls of the hole have the colour of the part with the cut.
     np.testing.assert_allclose(mesh.area_faces[first].sum(), 4 + 2 * 0.75 + 4 * 0.5, rtol=1e-9)
 
 
@@ -117,8 +117,8 @@ def test_shapes_are_watertight(category):
 
 
 @pytest.mark.parametrize(("index", "category"), [(0, "cabinet"), (3, "lamp"), (1, "vessel")])
-def test_the_mesh_is_solid_where_the_scene_is(index, category):
-    """Points differ only where the polyhedron misses the curve: 128 segments of radius 0.5 sag by 1.5e-4."""
+def test_the_mesh_has_the_occupancy_of_the_scene(index, category):
+    """Points differ only between the polyhedron and the curve: 128 segments of radius 0.5 deviate by 1.5e-4."""
     scene = synthetic13.shape(0, index, category).scene
     mesh = to_mesh(scene, segments=128)
     points = np.random.default_rng(0).uniform(*scene.bounds(), size=(4000, 3))
@@ -126,7 +126,7 @@ def test_the_mesh_is_solid_where_the_scene_is(index, category):
     found = mesh.contains(points)
     assert expected.any()
     assert not expected.all()
-    # Where they differ, the scene's surface is nearer than the sag: some point around is on its other side.
+    # Where they differ, the scene's surface is closer than that: some point around is on its other side.
     differing = points[found != expected]
     assert len(differing) < 12
     around = np.random.default_rng(1).normal(size=(200, 3))
@@ -135,7 +135,7 @@ def test_the_mesh_is_solid_where_the_scene_is(index, category):
     assert (inside != expected[found != expected][:, None]).any(1).all()
 
 
-def test_what_has_no_closed_surface_is_refused():
+def test_scenes_without_a_closed_surface_are_refused():
     with pytest.raises(OptionError, match="half-space has no closed surface"):
         to_mesh(Scene([box((0, 0, 0), (1, 1, 1)), half_space((0, 0, 0), (0, 1, 0))]))
     with pytest.raises(OptionError, match="Scene"):

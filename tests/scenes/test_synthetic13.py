@@ -1,4 +1,4 @@
-"""The shapes of Synthetic-13: varied, upright, connected, of parts without a common face."""
+"""The shapes of Synthetic-13: varied, upright, connected, without coincident faces."""
 
 import hashlib
 import importlib
@@ -39,7 +39,7 @@ def test_a_category_is_varied(category):
     assert 0 < found.iou <= 0.6
 
 
-def test_the_variety_is_what_it_says():
+def test_the_variety_is_measured():
     found = synthetic13.measure("sofa", count=5, size=16)
     made = [synthetic13.shape(0, index, "sofa") for index in range(5)]
     centers = (np.arange(16) + 0.5) / 16 - 0.5
@@ -54,7 +54,7 @@ def test_the_variety_is_what_it_says():
     assert found.parts == np.mean([len(item.scene.solids) for item in made])
 
 
-def test_the_box_before_cuts_is_centred_with_a_diagonal_of_one(shapes):
+def test_the_box_without_cuts_is_centred_with_a_diagonal_of_one(shapes):
     for shape in shapes:
         low, high = shape.scene.bounds()
         np.testing.assert_allclose(low, -high, atol=1e-12)
@@ -85,15 +85,15 @@ def test_a_shape_is_one_body():
 
 
 def mean_x_of_the_top(shape):
-    """Where along x the highest quarter of the object lies."""
+    """The mean x of the highest quarter of the object."""
     volume = scenes.voxels([shape.scene], 32)[0].numpy()  # (z, y, x)
     _, y, x = np.nonzero(volume)
     return (x[y >= y.max() - (y.max() - y.min()) / 4].mean() + 0.5) / 32 - 0.5
 
 
 def one_above_another(material):
-    """Parts of different sizes, all with a face at y = 1 over (0, 0) but for their place in the list."""
-    down, sizes = ((0, 1, 0), (0, -1, 0)), (2.0, 1.0, 2 / 3, 1 / 2)  # size times place is the same for three of them
+    """Parts of different sizes, all with a face at y = 1 above (0, 0) except for growth by their index."""
+    down, sizes = ((0, 1, 0), (0, -1, 0)), (2.0, 1.0, 2 / 3, 1 / 2)  # size times index is the same for three of them
     parts = [scenes.box((0, 1 - size / 2, 0), (size, size, size), material) for size in sizes]
     parts += [scenes.cylinder((0, 0, 0), (0, 1, 0), radius, material) for radius in (0.4, 0.7)]
     parts += [parts[0].moved((0.1, 0.6, 0)).minus(scenes.half_space(*down)) for _ in range(2)]
@@ -103,7 +103,7 @@ def one_above_another(material):
 
 
 def heights(solids, at=(0.0, 0.0)):
-    """The height at which each solid alone is hit from above, -infinity where it is not."""
+    """The height at which each single solid is hit from above, -infinity without a hit."""
     origin = torch.tensor([at[0], 2.0, at[1]], dtype=torch.float64)
     down = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
     alone = [scenes.Scene([solid]) for solid in solids]
@@ -111,7 +111,7 @@ def heights(solids, at=(0.0, 0.0)):
     return 2 - hits.distance[:, 0].numpy()
 
 
-def test_faces_that_coincide_come_apart(monkeypatch):
+def test_coincident_faces_are_separated(monkeypatch):
     paint = scenes.Material()
     made = one_above_another(paint)
     np.testing.assert_allclose(heights(made), 1, atol=1e-12)
@@ -119,7 +119,7 @@ def test_faces_that_coincide_come_apart(monkeypatch):
     solids = synthetic13.shape(0, 0, "lamp").scene.solids
     basins = [bool(solid.cuts) and solid.cuts[0].kind is scenes.Kind.CYLINDER for solid in solids]
     assert sum(basins) == 2
-    # The walls of a basin move with the faces around it: its floor sinks.
+    # The faces of a cut grow with those of its solid: the floor of a basin sinks.
     for some, sign in ((np.flatnonzero(np.invert(basins)), 1), (np.flatnonzero(basins), -1)):
         steps = sign * np.diff(heights([solids[place] for place in some])) / np.diff(some)
         np.testing.assert_allclose(steps, steps[0], rtol=1e-6)
@@ -136,7 +136,7 @@ def test_a_flush_hole_stays_open(monkeypatch):
 
 
 def parts_seen(shape, views, dtype):
-    """The place in the list of the part that each pixel shows, -1 for none, and the depth."""
+    """The index of the part in each pixel, -1 for none, and the depth."""
     count = len(shape.scene.solids)
     marked = [
         solid.painted(scenes.Material(((place + 1) / count, 0, 0))) for place, solid in enumerate(shape.scene.solids)
@@ -146,8 +146,8 @@ def parts_seen(shape, views, dtype):
     return (picture.images[0, :, 0] * count).round().long() - 1, picture.depth[0]
 
 
-def test_rounding_decides_no_colour():
-    """Of parts in different colours at one depth, float32 shows the same one as float64."""
+def test_colours_do_not_depend_on_rounding():
+    """Of parts with different colours at one depth, float32 renders the same one as float64."""
     for index in range(13 * 10):
         shape = synthetic13.shape(0, 80 + index)
         views = synthetic13.views(0, 80 + index, 2, 112)
@@ -155,14 +155,14 @@ def test_rounding_decides_no_colour():
         (single, depth), (double, exact) = (parts_seen(shape, views, dtype) for dtype in (torch.float32, torch.float64))
         colours = {material: number for number, material in enumerate(dict.fromkeys(materials(shape)))}
         colour = torch.tensor([colours[material] for material in materials(shape)] + [-1])
-        # A part before another shows at a silhouette, where rounding may decide; but then depths are unlike.
+        # At silhouettes rounding may decide, but then depths differ.
         flipped = (colour[single] != colour[double]) & ((depth - exact).abs() < 1e-3)
         seen = double >= 0
         assert flipped[seen].sum() <= 1e-3 * seen.sum(), shape.name
 
 
-def test_objects_stand_upright_and_face_x():
-    """The back of a chair or a sofa and the tail of an airplane are high, and behind."""
+def test_objects_are_upright_and_face_x():
+    """The back of a chair or a sofa and the tail of an airplane are high and at the rear."""
     chairs = [synthetic13.shape(2, index, "chair") for index in range(12)]
     sofas = [synthetic13.shape(2, index, "sofa") for index in range(24)]
     planes = [synthetic13.shape(2, index, "airplane") for index in range(24)]
@@ -193,7 +193,7 @@ def test_most_parts_have_one_colour_of_few(shapes):
     assert len({material.texture for shape in shapes for material in materials(shape)}) == 4
 
 
-def test_categories_take_turns(shapes):
+def test_categories_are_cycled(shapes):
     assert [shape.category for shape in shapes[:26]] == [*CATEGORIES, *CATEGORIES]
     assert len({shape.name for shape in shapes}) == len(shapes)
     assert shapes[17].name == "chair-00000017"
@@ -207,7 +207,7 @@ def test_the_synsets_and_the_two_halves():
     assert sorted(halves) == sorted(CATEGORIES)
 
 
-def test_a_shape_depends_on_its_numbers_alone(shapes):
+def test_a_shape_depends_only_on_its_numbers(shapes):
     np.random.seed(1)  # noqa: NPY002  global state must not matter
     torch.manual_seed(1)
     for index in (200, 3, 57):
@@ -226,7 +226,7 @@ def test_a_shape_depends_on_its_numbers_alone(shapes):
 
 
 def test_the_numbers_are_those_of_the_seeded_stream():
-    """The first draws of a chair, from numpy alone: a set made once can be made again."""
+    """The first draws of a chair, with numpy only: a set can be reproduced."""
     stream = np.random.Generator(np.random.PCG64(np.random.SeedSequence([5, 4, 0])))
     chair = synthetic13.shape(5, 4)
     picks = [int(stream.integers(7)), int(stream.integers(7))]
@@ -259,7 +259,7 @@ DIGESTS = {
 
 
 def digest(category):
-    """Of two shapes with their views: numbers to 1e-9, for LAPACK rounds differently elsewhere."""
+    """Numbers of two shapes and their views to 1e-9: LAPACK rounds differently elsewhere."""
     found = hashlib.sha256()
     for index in (0, 1):
         shape = synthetic13.shape(0, index, category)
@@ -280,7 +280,7 @@ def digest(category):
     return found.hexdigest()[:12]
 
 
-def test_what_a_seed_gives_belongs_to_a_version():
+def test_shapes_of_a_seed_are_those_of_this_version():
     digests = {category: digest(category) for category in CATEGORIES}
     assert (shape_sources.VERSION, digests) == (DIGESTS_OF_VERSION, DIGESTS), (
         "What a seed gives has changed, so training sets change: raise shape_sources.VERSION, and put the new version "
@@ -298,14 +298,14 @@ def test_views_look_at_the_origin_from_all_around():
     np.testing.assert_allclose(E[:, :3, 3], np.tile([0, 0, 2], (2000, 1)), atol=1e-12)
     elevation = np.degrees(np.arcsin(centers[:, 1] / 2))
     azimuth = np.degrees(np.arctan2(centers[:, 2], centers[:, 0])) % 360
-    # Kolmogorov's distance from the uniform distributions; 2000 draws exceed 0.05 once in 10^4.
+    # The Kolmogorov distance from the uniform distribution exceeds 0.05 once in 10^4 for 2000 draws.
     for angles, low, high in ((elevation, -20, 30), (azimuth, 0, 360)):
         assert low <= angles.min() <= angles.max() <= high
         expected = (np.sort(angles) - low) / (high - low)
         assert np.abs(expected - (np.arange(2000) + 0.5) / 2000).max() < 0.05
 
 
-def test_the_first_views_do_not_depend_on_how_many():
+def test_the_first_views_do_not_depend_on_the_count():
     few, many = synthetic13.views(1, 2, 3, 64), synthetic13.views(1, 2, 9, 64)
     torch.testing.assert_close(many.cam_from_world[:3], few.cam_from_world, rtol=0, atol=0)
     other = synthetic13.views(1, 3, 3, 64)
@@ -318,7 +318,7 @@ def test_the_split_is_seventy_ten_twenty():
         deviation = np.sqrt(share * (1 - share) / 5000)
         assert abs(parts.count(name) / 5000 - share) < 4 * deviation
     assert [synthetic13.split(1, index) for index in range(50)] != parts[:50]
-    # Within a category as well, though categories follow the index.
+    # Also within a category, although categories depend on the index.
     chairs = parts[4::13]
     assert 0.6 < chairs.count("train") / len(chairs) < 0.8
 
@@ -360,7 +360,7 @@ def test_a_parameter_has_one_name():
 
 
 class Ends(Parameters):
-    """Draws every number from the two ends of its range: what fails anywhere fails there first."""
+    """Draws every number from the two ends of its range, where failures are likeliest."""
 
     def uniform(self, name, low, high):
         self.numbers[name] = low if super().uniform(name, low, high) < (low + high) / 2 else high
@@ -385,7 +385,7 @@ def test_seeds_and_indices_are_checked(bad):
             call(0, bad)
 
 
-def test_impossible_requests():
+def test_invalid_requests():
     with pytest.raises(OptionError, match=r"category must be one of airplane, .*; got 'boat'"):
         synthetic13.shape(0, 0, "boat")
     with pytest.raises(ShapeError, match="count"):

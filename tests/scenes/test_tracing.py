@@ -12,14 +12,14 @@ from lsmgeo import VoxelGrid, scenes
 from lsmgeo.cameras import CameraTensors, orbit, resize
 from lsmgeo.scenes import rendering
 from tests import oracle
-from tests.oracle import solids as truth
+from tests.oracle import primitives as truth
 from tests.scenes.drawn import KINDS, Drawn, drawn, make
 
 SUN = scenes.Lights(torch.tensor([[0.0, 1.0, 0.0]]), torch.full((1, 3), 0.6), torch.full((3,), 0.3))
 
-# Where two surfaces are nearer to each other along a ray than this, rounding decides which of them is hit.
+# Where two surfaces are closer along a ray than this, rounding decides which is hit.
 EDGE = {torch.float64: 1e-9, torch.float32: 1e-4}
-# Depth is about 3 and the normal of a small ellipsoid turns with the hit's error over its radius.
+# Depth is about 3, and the error of a small ellipsoid's normal is that of the hit over its radius.
 DEPTH = {torch.float64: 1e-12, torch.float32: 2e-5}
 
 
@@ -28,20 +28,20 @@ def compare(found: scenes.Rendering, wanted: Drawn, dtype: torch.dtype) -> None:
         expected, normal, margin = truth.first_hit(wanted.parts, *wanted.rays(view))
         depth = found.depth[0, view].flatten().double().numpy()
         mask = found.mask[0, view].flatten().numpy()
-        # A silhouette's pixel is in doubt where the ray's stretch inside, or between two parts, is a sliver.
+        # Masks are uncertain where the ray's interval inside, or between two parts, is a sliver.
         clear = (margin > EDGE[dtype]) & np.isfinite(expected)
         np.testing.assert_array_equal(mask[clear], True)
         assert not (mask & ~np.isfinite(expected)).sum() > (0 if dtype == torch.float64 else 2)
         np.testing.assert_array_equal(depth[~mask], 0.0)
         np.testing.assert_allclose(depth[clear], expected[clear], rtol=DEPTH[dtype] * 10, atol=0)
         ours = found.normals[0, view].flatten(1).T.double().numpy()
-        # Near grazing the crossing itself is ill conditioned, and its normal with it.
+        # Near grazing angles the hit and its normal are ill conditioned.
         error = np.linalg.norm(ours - normal, axis=1)[clear] * np.minimum(margin[clear], 1)
         np.testing.assert_allclose(error, 0, atol=1e-8 if dtype == torch.float64 else 2e-3)
 
 
 @given(drawn())
-def test_pictures_agree_with_the_oracle(wanted):
+def test_renderings_agree_with_the_oracle(wanted):
     found = scenes.render([wanted.scene], wanted.cameras, SUN, dtype=torch.float64)
     compare(found, wanted, torch.float64)
     assert found.depth.dtype == torch.float64
@@ -55,12 +55,12 @@ def test_single_precision_agrees_away_from_edges(wanted):
 
 @settings(max_examples=30)
 @given(st.lists(drawn(), min_size=1, max_size=3), st.booleans())
-def test_views_rendered_together_are_views_rendered_alone(several, shadows):
-    """An accelerator visits many views' solids at once, a CPU one view's; the pictures are the same."""
+def test_views_rendered_together_equal_views_rendered_one_by_one(several, shadows):
+    """Accelerators render many views at once, CPUs one by one; the images are the same."""
     batch = CameraTensors(*(torch.cat([torch.as_tensor(one.cameras[i]) for one in several]) for i in range(2)), 15, 20)
     solids = [one.scene for one in several]
     options = {"shadows": shadows, "dtype": torch.float64}
-    strengths = torch.linspace(0.2, 0.6, len(several)).view(-1, 1, 1)  # each scene has lights of its own
+    strengths = torch.linspace(0.2, 0.6, len(several)).view(-1, 1, 1)  # each scene has its own lights
     lights = scenes.Lights(
         SUN.directions.expand(len(several), 1, 3), strengths.expand(-1, 1, 3), strengths[:, 0] * SUN.ambient
     )
@@ -77,7 +77,7 @@ def test_views_rendered_together_are_views_rendered_alone(several, shadows):
 @given(drawn())
 def test_rays_from_anywhere_agree_with_the_oracle(wanted):
     origins, directions = (np.concatenate([wanted.rays(view)[i] for view in range(2)]) for i in range(2))
-    lengths = np.linspace(0.2, 5, len(directions))[:, None]  # the parameter counts multiples of the direction
+    lengths = np.linspace(0.2, 5, len(directions))[:, None]  # the ray parameter is a multiple of the direction
     expected, normal, margin = truth.first_hit(wanted.parts, origins, directions * lengths)
     found = scenes.trace([wanted.scene], torch.tensor(origins)[None], torch.tensor(directions * lengths)[None])
     clear = margin > EDGE[torch.float64]
@@ -110,7 +110,7 @@ def test_shadows_agree_with_the_oracle(wanted):
     for view in range(2):
         origins, directions = wanted.rays(view)
         s, normal, margin = truth.first_hit(wanted.parts, origins, directions)
-        # Far from edges, and lit at more than a grazing angle; 1e-3 is ten times the offset of the shadow rays.
+        # Far from edges and grazing angles; 1e-3 is ten times the offset of the shadow rays.
         clear = np.isfinite(s) & (margin > 1e-3) & (normal @ towards > 0.02)
         at = origins[clear] + s[clear, None] * directions[clear] + 1e-3 * normal[clear]
         outside = ~truth.holds(wanted.parts, at)
@@ -118,7 +118,7 @@ def test_shadows_agree_with_the_oracle(wanted):
         sure = outside & (~np.isfinite(blocked) | ((blocked > 0.01) & (width > 0.01)))
         expected = 0.7 * (0.25 + 0.5 * (normal[clear] @ towards) * ~np.isfinite(blocked))
         colour = found.images[0, view, 0].flatten().numpy()[clear]
-        # At a shadow's edge the two offsets decide differently: not one pixel in a hundred.
+        # At edges of shadows the two offsets differ: fewer than one pixel in a hundred.
         different = ~np.isclose(colour, expected, atol=1e-6)[sure]
         assert different.sum() <= 1 + 0.01 * sure.sum()
 
@@ -136,7 +136,7 @@ def test_bounds_are_those_of_the_surface(kind):
     inside = points[shape.holds(points)]
     assert (inside >= lower).all()
     assert (inside <= upper).all()
-    # Points reach every side to within what so many points can show.
+    # Random points come close to every side.
     np.testing.assert_allclose(inside.min(0), lower, atol=0.12)
     np.testing.assert_allclose(inside.max(0), upper, atol=0.12)
 
@@ -145,14 +145,14 @@ def room() -> scenes.Scene:
     return scenes.Scene([scenes.box((0, 0, 0), (4, 4, 4)).minus(scenes.box((0, 0, 0), (3, 3, 3)))])
 
 
-def test_a_room_is_seen_from_within():
+def test_a_room_is_visible_from_inside():
     camera = CameraTensors(torch.tensor([[[[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]]]), torch.eye(4)[None, None], 9, 9)
     found = scenes.render([room()], camera, SUN)
     torch.testing.assert_close(found.depth, torch.full((1, 1, 9, 9), 1.5))
     torch.testing.assert_close(found.normals[0, 0, :, 4, 4], torch.tensor([0.0, 0.0, -1.0]))
 
 
-def test_a_solid_that_holds_the_camera_is_not_seen():
+def test_a_solid_that_contains_the_camera_is_invisible():
     camera = CameraTensors(torch.tensor([[[[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]]]), torch.eye(4)[None, None], 9, 9)
     around, ahead = scenes.sphere((0, 0, 0), 1), scenes.box((0, 0, 5), (4, 4, 2))
     assert not scenes.render([scenes.Scene([around])], camera, SUN).mask.any()
@@ -165,13 +165,13 @@ def test_a_sphere_at_the_centre_of_the_view():
     torch.testing.assert_close(found.depth[0, :, 16, 16], torch.full((2,), 1.5))
     centers = -views.cam_from_world[0, :, :3, :3].transpose(1, 2) @ views.cam_from_world[0, :, :3, 3:]
     torch.testing.assert_close(found.normals[0, :, :, 16, 16], centers[..., 0] / 2)
-    # The silhouette is a circle of tangent: sin a = r / |C|.
+    # The silhouette is a circle with sin a = r / |C|.
     v, u = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
     inside = u.square() + v.square() < (60 * np.tan(np.arcsin(0.25))) ** 2
     assert torch.equal(found.mask[0, 0], inside)
 
 
-def test_the_nearest_of_many_wins_whatever_their_order():
+def test_the_nearest_of_many_is_hit_in_any_order():
     solids = [scenes.sphere((0, 0, z), 0.3, scenes.Material((z / 10, 0, 0))) for z in (3.0, 5.0, 7.0)]
     camera = CameraTensors(torch.tensor([[[[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]]]), torch.eye(4)[None, None], 9, 9)
     for order in ((0, 1, 2), (2, 1, 0), (1, 2, 0)):
@@ -189,11 +189,11 @@ def test_a_floor_reaches_the_horizon():
 
 @settings(max_examples=50)
 @given(drawn(), st.booleans())
-def test_voxels_agree_with_the_oracle(wanted, turned):
+def test_voxels_agree_with_the_oracle(wanted, rotated):
     pose = np.eye(4)
-    if turned:
+    if rotated:
         pose[:3, :3] = oracle.rotation(np.array([0.3, -0.5, 0.2]))
-    matrix = torch.from_numpy(pose) if turned else None
+    matrix = torch.from_numpy(pose) if rotated else None
     grid = VoxelGrid((5, 6, 7), (-0.9, -0.8, -0.7), (0.8, 0.9, 1.0), world_from_grid=matrix)
     points = oracle.voxel_sites((5, 6, 7), np.array([-0.9, -0.8, -0.7]), np.array([0.8, 0.9, 1.0]), pose).reshape(-1, 3)
     found = scenes.voxels([wanted.scene], grid)
@@ -202,7 +202,7 @@ def test_voxels_agree_with_the_oracle(wanted, turned):
 
 
 def test_a_cut_flush_with_a_face_opens_it():
-    """A drawer: no lid of rounding remains, wherever the camera is; nor a wall between cuts that touch."""
+    """A drawer: rounding leaves no lid for any camera, and no wall between touching cuts."""
     drawer = scenes.box((0.1, 0, 0.05), (1, 0.5, 1)).minus(scenes.box((0.1, 0.05, 0.05), (0.8, 0.4, 0.8)))
     halves = scenes.box((0.1, 0, 0.05), (1, 0.5, 1)).minus(
         scenes.box((-0.1, 0.05, 0.05), (0.4, 0.4, 0.8)), scenes.box((0.3, 0.05, 0.05), (0.4, 0.4, 0.8))
@@ -225,7 +225,7 @@ def test_a_cut_flush_with_a_face_opens_it():
     assert floor[0] == floor[2]
 
 
-def test_a_hole_through_flush_at_both_ends_is_seen_through():
+def test_a_hole_that_is_flush_at_both_ends_is_open():
     plate = scenes.box((0, 0.1, 0), (1, 0.2, 1)).minus(scenes.box((0, 0.1, 0), (0.5, 0.2, 0.5)))
     view = orbit(torch.tensor([[30.0]]), 85.0, 3.0, focal_length=120.0, height=61, width=61, target=(0.0, 0.1, 0.0))
     found = scenes.render([scenes.Scene([plate])], view, SUN)
@@ -275,7 +275,7 @@ def test_nothing_is_recorded_for_derivatives():
 
 @settings(max_examples=30)
 @given(drawn(), st.integers(0, 2))
-def test_a_mirrored_scene_is_the_mirrored_picture(wanted, axis):
+def test_a_mirrored_scene_gives_the_mirrored_image(wanted, axis):
     origins, directions = (torch.from_numpy(np.array(rays))[None] for rays in wanted.rays(0))
     mirror = torch.ones(3, dtype=torch.float64)
     mirror[axis] = -1

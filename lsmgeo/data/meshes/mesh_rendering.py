@@ -18,7 +18,7 @@ from lsmgeo.data.meshes import DEFAULT_COLOUR, Mesh, check_mesh
 from lsmgeo.data.meshes.mesh_topology import corner_normals, face_normals
 from lsmgeo.errors import BackendError, ShapeError
 from lsmgeo.scenes import Lights, Rendering, shade
-from lsmgeo.scenes.inputs import behind, checked_lights
+from lsmgeo.scenes.inputs import background_array, checked_lights
 
 __all__ = ["render_mesh"]
 
@@ -106,7 +106,7 @@ def render_mesh(
     box = torch.cartesian_prod(*torch.from_numpy(mesh.bounds).to(tensors.device, torch.float64).unbind(1))
     corners_seen = matrices.homogeneous_pixels(box).numpy(force=True)  # (V, 8, 3)
 
-    images = behind(who, background, (len(centers), 3, *size), torch.device("cpu"), torch.float32)
+    images = background_array(who, background, (len(centers), 3, *size), torch.device("cpu"), torch.float32)
     depth, mask = torch.zeros(len(centers), *size), torch.zeros(len(centers), *size, dtype=torch.bool)
     out = Rendering(images, depth, torch.zeros_like(images), mask)
     flat = face_normals(mesh.vertices, mesh.faces)

@@ -24,27 +24,22 @@ SHAPES = {
     "delta fighter": ((0.5, 0.8), (0.3, 0.45), (0.45, 0.65), (0.045, 0.07)),
     "four engines": ((0.9, 1.4), (0.0, 0.2), (0.15, 0.24), (0.06, 0.095)),
 }
+TAILS = {
+    "rear jets": ("T",),
+    "delta fighter": ("fin", "twin fins"),
+    "low wing": ("conventional", "V", "twin fins"),
+}
 
 
 def build(p: Parameters, colours: Palette) -> list[Solid]:
     """The parts of one airplane, 1 long."""
     kind = p.choice("kind", KINDS)
     jet = kind in ("airliner", "rear jets", "delta fighter")
-    tail = p.choice(
-        "tail",
-        {"rear jets": ("T",), "delta fighter": ("fin", "twin fins")}.get(
-            kind, ("conventional", "T") if kind != "low wing" else ("conventional", "V", "twin fins")
-        ),
-    )
+    tail = p.choice("tail", TAILS.get(kind, ("conventional", "T")))
     gear = p.choice("gear", ("none", "wheels") if jet or kind == "glider" else ("wheels", "floats", "wheels"))
-    (span, sweep, chord, radius) = (
-        p.uniform(name, *limits)
-        for name, limits in zip(("span", "sweep", "root_chord", "radius"), SHAPES[kind], strict=True)
-    )
-    taper, dihedral = (
-        p.uniform("taper", 0.15, 0.4) if jet else p.uniform("taper", 0.5, 0.95),
-        p.uniform("dihedral", 0.0, 0.08),
-    )
+    span, sweep, chord, radius = p.uniforms(("span", "sweep", "root_chord", "radius"), SHAPES[kind])
+    taper = p.uniform("taper", *((0.15, 0.4) if jet else (0.5, 0.95)))
+    dihedral = p.uniform("dihedral", 0.0, 0.08)
     place = p.uniform("wing_place", -0.02, 0.14) - (0.22 if kind == "delta fighter" else 0.0)
     high = kind in ("high wing", "four engines", "glider")
     level = radius * (0.75 if high else -0.5)
@@ -54,21 +49,11 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     parts += pair(wing((place, level, 0), tip, chord, taper * chord, 0.035, colours.trim))
     if kind == "biplane":
         gap = p.uniform("wing_gap", 0.14, 0.22)
-        upper = wing(
-            (place + 0.03, level + gap, 0),
-            (place + 0.03 - sweep, level + gap + dihedral, span / 2),
-            chord,
-            taper * chord,
-            0.035,
-            colours.trim,
-        )
-        strut = bar(
-            (place - 0.6 * sweep, level, 0.3 * span),
-            (place + 0.03 - 0.6 * sweep, level + gap + 0.6 * dihedral, 0.3 * span),
-            0.03,
-            0.02,
-            colours.detail,
-        )
+        root, tip = (place + 0.03, level + gap, 0), (place + 0.03 - sweep, level + gap + dihedral, span / 2)
+        upper = wing(root, tip, chord, taper * chord, 0.035, colours.trim)
+        foot = (place - 0.6 * sweep, level, 0.3 * span)
+        head = (place + 0.03 - 0.6 * sweep, level + gap + 0.6 * dihedral, 0.3 * span)
+        strut = bar(foot, head, 0.03, 0.02, colours.detail)
         cabane = bar((place, 0, 0.03), (place, level + gap, 0.05), 0.03, 0.02, colours.detail)
         parts += pair(upper, strut, cabane)
     parts += _tail(p, tail, colours, radius)
@@ -111,17 +96,12 @@ def _tail(p: Parameters, tail: str, colours: Palette, radius: float) -> list[Sol
     if tail in ("twin fins", "fin"):
         if tail == "fin":
             return [*level, wing((root, 0, 0), (end, low + fin, 0), 1.3 * chord, 0.5 * chord, 0.03, colours.detail)]
-        side = 0.85 * reach
-        return level + pair(
-            wing((end, low - 0.02, side), (end, low + 0.8 * fin, side), 0.9 * chord, 0.6 * chord, 0.03, colours.detail)
-        )
+        foot, head = (end, low - 0.02, 0.85 * reach), (end, low + 0.8 * fin, 0.85 * reach)
+        return level + pair(wing(foot, head, 0.9 * chord, 0.6 * chord, 0.03, colours.detail))
     upright = wing((root, 0, 0), (end, low + fin, 0), 1.15 * chord, 0.6 * chord, 0.03, colours.detail)
     if tail == "T":
         top = low + fin - 0.015
-        return [
-            upright,
-            *pair(wing((end, top, 0), (end - 0.03, top, reach), 0.8 * chord, 0.5 * chord, 0.03, colours.trim)),
-        ]
+        level = pair(wing((end, top, 0), (end - 0.03, top, reach), 0.8 * chord, 0.5 * chord, 0.03, colours.trim))
     return [upright, *level]
 
 

@@ -44,16 +44,9 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     rise = p.uniform("arm_height", 0.16, 0.26)
     places = {"none": (), "ends": (-z + 0.04, z - 0.04), "ends and middle": (-z + 0.04, 0.0, z - 0.04)}[arms]
     for place in places:
-        parts.append(
-            block((-x - 0.04, height + rise - 0.05, place - 0.04), (x, height + rise, place + 0.04), colours.trim)
-        )
-        parts.append(
-            block(
-                (x - 0.08, height - 0.5 * thickness, place - 0.03),
-                (x - 0.02, height + rise, place + 0.03),
-                colours.trim,
-            )
-        )
+        rest = (-x - 0.04, height + rise - 0.05, place - 0.04), (x, height + rise, place + 0.04)
+        post = (x - 0.08, height - 0.5 * thickness, place - 0.03), (x - 0.02, height + rise, place + 0.03)
+        parts += [block(*rest, colours.trim), block(*post, colours.trim)]
     return parts
 
 
@@ -118,26 +111,17 @@ def _back(p: Parameters, back: str, colours: Palette, low: float, x: float, z: f
     if back == "plank":
         return [slab((-x, low), (-x + thick, top), z, colours.body)]
     if back == "slats":
-        return posts + rack(
-            (-x, low + 0.25 * tall, -z), (-x + thick, top, z), 1, p.count("back_slats", 2, 4), colours.body, 0.65
-        )
+        count = p.count("back_slats", 2, 4)
+        return posts + rack((-x, low + 0.25 * tall, -z), (-x + thick, top, z), 1, count, colours.body, 0.65)
     rails = [slab((-x, y - 0.05), (-x + thick, y), z, colours.trim) for y in (low + 0.22 * tall, top)]
     if back == "bars":
-        count = p.count("bars", 7, 12)
-        return (
-            rails + posts + rack((-x + 0.1 * thick, low, -z), (-x + 0.7 * thick, top, z), 2, count, colours.body, 0.35)
-        )
-    crossed = [
-        bar(
-            (0, low + 0.2 * tall, s * 0.9 * z),
-            (0, top - 0.03, (s - 0.9 * (1 if s > 0 else -1)) * z),
-            0.06,
-            0.08,
-            colours.body,
-        )
-        for s in (-0.95, -0.05, 0.05, 0.95)
-    ]
-    return rails + posts + [part.moved((-x + 0.4 * thick, 0, 0)) for part in crossed]
+        start, end, count = (-x + 0.1 * thick, low, -z), (-x + 0.7 * thick, top, z), p.count("bars", 7, 12)
+        return rails + posts + rack(start, end, 2, count, colours.body, 0.35)
+    crossed = []
+    for s in (-0.95, -0.05, 0.05, 0.95):
+        start, end = (0, low + 0.2 * tall, s * 0.9 * z), (0, top - 0.03, (s - 0.9 * (1 if s > 0 else -1)) * z)
+        crossed.append(bar(start, end, 0.06, 0.08, colours.body).moved((-x + 0.4 * thick, 0, 0)))
+    return rails + posts + crossed
 
 
 def _picnic_table(p: Parameters, colours: Palette, height: float, depth: float, z: float, side: float) -> list[Solid]:
@@ -149,12 +133,8 @@ def _picnic_table(p: Parameters, colours: Palette, height: float, depth: float, 
         low, high = sorted((s * out, s * (out + 0.6 * depth)))
         parts += _seat(p, "plank", colours, (low, height - 0.07, -z), (high, height, z))
     place = 0.75 * side
-    legs = [
-        bar(
-            (s * (out + 0.25 * depth), 0, place), (s * 0.6 * table, top - 0.04, place), 1.5 * width, width, colours.trim
-        )
-        for s in (-1, 1)
-    ]
+    ends = (((s * (out + 0.25 * depth), 0, place), (s * 0.6 * table, top - 0.04, place)) for s in (-1, 1))
+    legs = [bar(foot, head, 1.5 * width, width, colours.trim) for foot, head in ends]
     beam = box((0, height - 0.1, place), (2 * out + depth, 0.1, width), colours.trim)
     head = box((0, top - 0.1, place), (1.9 * table, 0.08, width), colours.trim)
     return parts + pair(*legs, beam, head) + [box((0, height - 0.1, 0), (0.08, 0.08, 2 * place), colours.trim)]

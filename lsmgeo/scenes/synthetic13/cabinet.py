@@ -137,18 +137,8 @@ def _stand(p: Parameters, stand: str, colours: Palette, lift: float, x: float, z
     if stand == "wheels":
         return pair(*(sphere((s * (x - width), lift / 2, z - width), lift / 2 + 0.02, colours.dark) for s in (-1, 1)))
     lean = 0.5 * width
-    return pair(
-        *(
-            bar(
-                (s * (x - width + lean), 0, z - width + lean),
-                (s * (x - width), lift + 0.02, z - width),
-                width,
-                width,
-                colours.detail,
-            )
-            for s in (-1, 1)
-        )
-    )
+    ends = (((s * (x - width + lean), 0, z - width + lean), (s * (x - width), lift + 0.02, z - width)) for s in (-1, 1))
+    return pair(*(bar(foot, head, width, width, colours.detail) for foot, head in ends))
 
 
 def _ladder(p: Parameters, colours: Palette, height: float, width: float, depth: float, wall: float) -> list[Solid]:

@@ -58,17 +58,9 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
         tub = slab((window, clearance + 0.3 * belt), (windscreen, waist + 1.0), z - 0.18, colours.dark)
         parts[0] = parts[0].minus(tub)
         glass = bar((windscreen, waist - 0.03, 0), (windscreen - 0.6 * cabin, top, 0), 0.12, width - 0.2, colours.dark)
-        seats = [
-            bar(
-                (s, clearance + 0.25 * belt, 0.24 * width),
-                (s - 0.15, waist + 0.25, 0.24 * width),
-                0.2,
-                0.3 * width,
-                colours.trim,
-            )
-            for s in (0.5 * (windscreen + window),)
-        ]
-        parts += [glass, *pair(*seats)]
+        middle = 0.5 * (windscreen + window)
+        foot, head = (middle, clearance + 0.25 * belt, 0.24 * width), (middle - 0.15, waist + 0.25, 0.24 * width)
+        parts += [glass, *pair(bar(foot, head, 0.2, 0.3 * width, colours.trim))]
     else:
         parts += _cabin(kind, colours, (window, windscreen), (waist, top), z, rake * cabin, slope * cabin)
     if kind == "pickup":
@@ -124,23 +116,14 @@ def _cabin(kind: str, colours: Palette, ends: Pair, levels: Pair, z: float, rake
     glass = below(below(glass, (front - rake, top), (front, waist)), (rear, waist), (rear + slope, top))
     roof = slab((rear + slope, top - 0.1), (front - rake, top), 0.96 * z - tumble, colours.body)
     place = 0.5 * (rear + slope + front - rake)
-    pillars = [
-        bar(
-            (front - 0.04, waist - 0.05, 0.95 * z),
-            (front - rake - 0.02, top - 0.03, 0.95 * z - 0.5 * tumble),
-            0.09,
-            0.1,
-            colours.body,
-        ),
-        bar(
-            (rear + 0.05, waist - 0.05, 0.95 * z),
-            (rear + slope + 0.03, top - 0.03, 0.95 * z - 0.5 * tumble),
-            0.16,
-            0.1,
-            colours.body,
-        ),
-        bar((place, waist - 0.05, 0.95 * z), (place, top - 0.03, 0.95 * z - 0.5 * tumble), 0.12, 0.1, colours.body),
-    ]
+    pillars = []
+    for start, end, width in (
+        (front - 0.04, front - rake - 0.02, 0.09),
+        (rear + 0.05, rear + slope + 0.03, 0.16),
+        (place, place, 0.12),
+    ):
+        low, high = (start, waist - 0.05, 0.95 * z), (end, top - 0.03, 0.95 * z - 0.5 * tumble)
+        pillars.append(bar(low, high, width, 0.1, colours.body))
     if kind == "van":
         panel = block((rear, waist - 0.05, 0.5 * z), (0.45 * rear + 0.55 * front, top - 0.02, 0.97 * z), colours.body)
         pillars.append(panel)
@@ -166,9 +149,8 @@ def _extras(
         if load == "rails":
             parts += pair(block((first, top - 0.02, 0.6 * z), (last, top + 0.1, 0.68 * z), colours.detail))
         elif load == "box":
-            parts.append(
-                ellipsoid(((first + last) / 2, top + 0.1, 0), (0.5 * (last - first), 0.2, 0.5 * z), colours.trim)
-            )
+            radii = (0.5 * (last - first), 0.2, 0.5 * z)
+            parts.append(ellipsoid(((first + last) / 2, top + 0.1, 0), radii, colours.trim))
         elif load == "sign":
             parts.append(box(((first + last) / 2, top + 0.1, 0), (0.22, 0.25, 0.6 * z), colours.trim))
     if kind in ("off-roader", "sedan", "coupe", "hatchback"):
@@ -209,9 +191,7 @@ def _racing_car(p: Parameters, colours: Palette, radius: float, tread: float) ->
         *pair(block((-x, 0.5 * waist, 0.62 * z), (-x + 0.5, high + 0.12, 0.68 * z), colours.detail)),
         slab((-x + 0.1, 0.4), (-x + 0.3, 0.6), 0.62 * z, colours.detail),
     ]
-    for place, size in ((0.66 * x, 1.0), (-x + 0.75, 1.15)):
-        parts += pair(
-            *wheel((place, radius * size, z - tread), radius * size, 1.4 * tread, colours.dark, colours.detail)
-        )
+    for place, size in ((0.66 * x, radius * 1.0), (-x + 0.75, radius * 1.15)):
+        parts += pair(*wheel((place, size, z - tread), size, 1.4 * tread, colours.dark, colours.detail))
         parts.append(box((place, radius, 0), (0.14, 0.14, 2 * z - 2 * tread), colours.detail))
     return parts

@@ -61,21 +61,12 @@ def _base(p: Parameters, base: str, colours: Palette, floor: float, x: float, z:
         ]
         rung = p.uniform("rung_height", 0.15, 0.7) * floor
         spread = 1 + out * (1 - rung / top) / (x - width / 2)
-        side = z - width / 2 + out * (1 - rung / top)
-        rail = block(
-            (-spread * (x - width / 2), rung - 0.02, side - 0.02),
-            (spread * (x - width / 2), rung + 0.02, side + 0.02),
-            ground,
-        )
-        return pair(*legs, rail)
+        end, side = spread * (x - width / 2), z - width / 2 + out * (1 - rung / top)
+        return pair(*legs, block((-end, rung - 0.02, side - 0.02), (end, rung + 0.02, side + 0.02), ground))
     if base == "pedestal":
         foot = p.uniform("foot_radius", 0.18, 0.34)
-        flare = pillar((0, 0.03, 0), 0.3 * floor, 0.6 * foot, ground, 0.5 * width)
-        return [
-            pillar((0, 0, 0), 0.04, foot, ground),
-            flare,
-            pillar((0, 0.02, 0), top, 0.7 * width, ground),
-        ]
+        disc, post = pillar((0, 0, 0), 0.04, foot, ground), pillar((0, 0.02, 0), top, 0.7 * width, ground)
+        return [disc, pillar((0, 0.03, 0), 0.3 * floor, 0.6 * foot, ground, 0.5 * width), post]
     if base == "star":
         reach, arms = p.uniform("star_reach", 0.24, 0.36), p.count("star_arms", 4, 6)
         wheels = [part.moved((0, -0.045, 0)) for part in spokes((0, 0.12, 0), reach, 0.06, arms, width, ground)]
@@ -109,19 +100,11 @@ def _back(p: Parameters, back: str, colours: Palette, height: float, x: float, z
     stiles = pair(block((-x, low, narrow - width), (-x + thick, top, narrow), colours.trim))
     inside, head = narrow - width / 2, block((-x, top - 2 * width, -narrow), end, colours.trim)
     if back == "vertical slats":
-        slats = rack(
-            (-x + 0.2 * thick, low, -inside),
-            (-x + 0.8 * thick, top - width, inside),
-            2,
-            p.count("slats", 3, 5),
-            colours.body,
-        )
-        return [*stiles, head, *slats]
+        start, end = (-x + 0.2 * thick, low, -inside), (-x + 0.8 * thick, top - width, inside)
+        return [*stiles, head, *rack(start, end, 2, p.count("slats", 3, 5), colours.body)]
     if back == "horizontal slats":
-        count = p.count("slats", 2, 4)
-        return stiles + rack(
-            (-x, height + 0.2 * tall, -inside), (-x + 0.8 * thick, top, inside), 1, count, colours.body, 0.6
-        )
+        start, end = (-x, height + 0.2 * tall, -inside), (-x + 0.8 * thick, top, inside)
+        return stiles + rack(start, end, 1, p.count("slats", 2, 4), colours.body, 0.6)
     low_rail = slab((-x, height + 0.25 * tall), (-x + thick, height + 0.25 * tall + width), narrow, colours.trim)
     pad = slab((-x + 0.2 * thick, height + 0.45 * tall), (-x + 0.9 * thick, top - 0.1 * tall), inside, colours.body)
     return [*stiles, head, low_rail, pad]

@@ -30,9 +30,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     """The parts of one display; its screen faces +x."""
     kind = p.choice("kind", tuple(SHAPES))
     frame = p.choice("frame", ("even", "chin", "thin"))
-    (wide, ratio, thick) = (
-        p.uniform(name, *limits) for name, limits in zip(("width", "aspect", "thickness"), SHAPES[kind], strict=True)
-    )
+    wide, ratio, thick = p.uniforms(("width", "aspect", "thickness"), SHAPES[kind])
     tall, bezel = wide * ratio, p.uniform("bezel", 0.03, 0.08)
     tilt = p.uniform("tilt", 0, 14)
     if frame == "thin":
@@ -54,12 +52,8 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     if kind == "tripod":
         reach, hub = p.uniform("foot_reach", 0.3, 0.55), p.uniform("hub_height", 0.5, 0.8) * rise
         pole = pillar((-thick - 0.02, 0.1, 0), rise + 0.5 * tall, 0.035, colours.trim)
-        return [
-            *head,
-            pole,
-            _joint(rise, tall, thick, colours),
-            *spokes((-thick - 0.02, hub, 0), reach, hub, 3, 0.05, colours.trim),
-        ]
+        legs = spokes((-thick - 0.02, hub, 0), reach, hub, 3, 0.05, colours.trim)
+        return [*head, pole, _joint(rise, tall, thick, colours), *legs]
     return head + _stand(p, kind, colours, rise, wide, tall, thick)
 
 
@@ -74,14 +68,8 @@ def _screen(colours: Palette, wide: float, tall: float, thick: float, bezel: flo
 def _housing(p: Parameters, colours: Palette, wide: float, tall: float, thick: float) -> list[Solid]:
     """The housing behind a flat screen."""
     deep, share = p.uniform("housing_depth", 0.03, 0.12), p.uniform("housing_size", 0.4, 0.75)
-    return [
-        slab(
-            (-thick - deep, 0.5 * tall * (1 - share)),
-            (-thick + 0.01, 0.5 * tall * (1 + share)),
-            wide / 2 * share,
-            colours.trim,
-        )
-    ]
+    low, high = (-thick - deep, 0.5 * tall * (1 - share)), (-thick + 0.01, 0.5 * tall * (1 + share))
+    return [slab(low, high, wide / 2 * share, colours.trim)]
 
 
 def _joint(rise: float, tall: float, thick: float, colours: Palette) -> Solid:
@@ -92,42 +80,31 @@ def _stand(
     p: Parameters, kind: str, colours: Palette, rise: float, wide: float, tall: float, thick: float
 ) -> list[Solid]:
     """What stands on y = 0 and holds the slab, whose lower edge is at ``rise``."""
-    stand = p.choice(
-        "stand",
-        ("two feet", "V", "plate", "disc")
-        if kind == "television"
-        else ("disc", "plate", "V", "arm", "easel", "bent sheet"),
-    )
+    usual = ("disc", "plate", "V", "arm", "easel", "bent sheet")
+    stand = p.choice("stand", ("two feet", "V", "plate", "disc") if kind == "television" else usual)
     neck, reach = p.uniform("neck_width", 0.05, 0.16), p.uniform("foot_reach", 0.16, 0.3)
     broad = p.uniform("foot_width", 0.35, 0.7) * wide
     x, up = -0.5 * thick, rise + 0.5 * tall
     joint = _joint(rise, tall, thick, colours)
     post = slab((-thick - 0.1, 0), (-thick - 0.04, up), neck / 2, colours.trim)
     if stand == "two feet":
-        place = 0.36 * wide
-        return pair(
-            *(bar((x + s * reach, 0, place), (x, rise + 0.05, place), 0.05, 0.05, colours.trim) for s in (-1, 1))
-        )
+        head = (x, rise + 0.05, 0.36 * wide)
+        return pair(*(bar((x + s * reach, 0, 0.36 * wide), head, 0.05, 0.05, colours.trim) for s in (-1, 1)))
     if stand == "V":
         fork = [bar((reach, 0.0, 0.45 * broad), (-thick - 0.07, 0.06, 0.0), 0.12, 0.05, colours.trim)]
         return [post, joint, *pair(*fork)]
     if stand == "plate":
         return [post, joint, slab((-reach - 0.1, 0), (reach, 0.035), broad / 2, colours.trim)]
     if stand == "disc":
-        disc = pillar((0, 0, 0), 0.04, 1.0, colours.trim).scaled((reach, 1, 0.5 * broad))
-        return [
-            post,
-            joint,
-            disc.moved((-thick, 0, 0)),
-            pillar((-thick - 0.07, 0.03, 0), 0.12, 0.8 * neck, colours.trim, 0.4 * neck),
-        ]
+        disc = pillar((0, 0, 0), 0.04, 1.0, colours.trim).scaled((reach, 1, 0.5 * broad)).moved((-thick, 0, 0))
+        return [post, joint, disc, pillar((-thick - 0.07, 0.03, 0), 0.12, 0.8 * neck, colours.trim, 0.4 * neck)]
     if stand == "arm":
         back = -thick - 0.35
-        rods = [
+        upright, arm = (
             pillar((back, 0, 0), up, 0.04, colours.trim),
             rod((back, up - 0.05, 0), -thick, 0.035, colours.trim),
-        ]
-        return [*rods, joint, slab((back - 0.12, 0), (back + 0.12, 0.05), 0.12, colours.detail)]
+        )
+        return [upright, arm, joint, slab((back - 0.12, 0), (back + 0.12, 0.05), 0.12, colours.detail)]
     if stand == "easel":
         legs = [bar((-thick - 0.3, 0, 0.25 * broad), (-thick - 0.02, up, 0.12 * broad), 0.05, 0.05, colours.trim)]
         fronts = [bar((0.08, 0, 0.4 * broad), (-thick, rise + 0.1, 0.4 * broad), 0.05, 0.05, colours.trim)]
@@ -144,15 +121,8 @@ def _stand(
 def _laptop(p: Parameters, colours: Palette, screen: list[Solid], wide: float, tilt: float) -> list[Solid]:
     deep, thick = p.uniform("base_depth", 0.5, 0.72) * wide, p.uniform("base_thickness", 0.04, 0.07)
     margin = p.uniform("keyboard_margin", 0.05, 0.1)
-    keys = rack(
-        (0.25 * deep, thick - 0.02, -wide / 2 + margin),
-        (0.62 * deep, thick + 0.012, wide / 2 - margin),
-        0,
-        4,
-        colours.dark,
-        0.7,
-    )
-    keys = [part.moved((-0.18 * deep, 0, 0)) for part in keys]
+    low, high = (0.25 * deep, thick - 0.02, -wide / 2 + margin), (0.62 * deep, thick + 0.012, wide / 2 - margin)
+    keys = [part.moved((-0.18 * deep, 0, 0)) for part in rack(low, high, 0, 4, colours.dark, 0.7)]
     pad = slab((0.68 * deep, thick - 0.01), (0.92 * deep, thick + 0.008), 0.15 * wide, colours.detail)
     hinge = cylinder((0, thick, -0.4 * wide), (0, thick, 0.4 * wide), 0.03, colours.trim)
     angle = tilt + p.uniform("opening", 0, 18)
@@ -175,9 +145,8 @@ def _tube(p: Parameters, colours: Palette, screen: list[Solid], wide: float, tal
     if stand == "swivel":
         parts.append(pillar((x, 0, 0), lift + 0.12 * tall, 0.3 * wide, colours.detail, 0.2 * wide))
     elif stand == "feet":
-        parts += pair(
-            block((-thick - 0.5 * deep, 0, 0.25 * wide), (-0.02, lift + 0.1 * tall, 0.33 * wide), colours.detail)
-        )
+        low, high = (-thick - 0.5 * deep, 0, 0.25 * wide), (-0.02, lift + 0.1 * tall, 0.33 * wide)
+        parts += pair(block(low, high, colours.detail))
     size = p.uniform("knob", 0.02, 0.035)
     knobs = [rod((-0.02, lift + y * tall, 0.44 * wide), 0.03, size, colours.detail) for y in (0.06, 0.14)]
     return parts + knobs

@@ -47,9 +47,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
         end = bend[-1]
         rods = ring([(-reach, 0, 0), *bend, (end[0] + 0.01, end[1] - 0.1, 0)], rod, colours.trim)
         hung = _shade(p, shade, colours, (end[0] + 0.01, end[1] - 0.05 - tall, 0), radius, tall)
-        stem = cylinder(
-            (end[0] + 0.01, end[1] - 0.05 - 0.6 * tall, 0), (end[0] + 0.01, end[1] - 0.04, 0), rod, colours.trim
-        )
+        stem = pillar((end[0] + 0.01, end[1] - 0.05 - 0.6 * tall, 0), end[1] - 0.04, rod, colours.trim)
         return [*_foot(p, colours, foot, (-reach, 0, 0)), *rods, *hung, stem]
     top = height * (1.35 if kind in ("floor", "tripod") else 0.55)
     if kind == "table":
@@ -107,15 +105,10 @@ def _shade(p: Parameters, shade: str, colours: Palette, base: Point, radius: flo
         return [tube(bottom, top, radius, end * radius, min(0.035, 0.6 * end * radius), colours.body), plate]
     if shade == "stack":
         step = p.uniform("stack_step", 0.12, 0.26)
-        sizes = [radius * (1 - step * k) for k in range(3)]
-        return [
-            ellipsoid((x, y + tall * (0.15 + 0.3 * k), z), (size, 0.2 * tall, size), colours.body)
-            for k, size in enumerate(sizes)
-        ]
-    dome = ellipsoid((x, y, z), (radius, tall, radius), colours.body)
-    dome = dome.minus(
-        ellipsoid((x, y - 0.03, z), (radius - 0.03, tall - 0.02, radius - 0.03)), half_space((x, y, z), (0, 1, 0))
-    )
+        rings = ((y + tall * (0.15 + 0.3 * k), radius * (1 - step * k)) for k in range(3))
+        return [ellipsoid((x, level, z), (size, 0.2 * tall, size), colours.body) for level, size in rings]
+    inner = ellipsoid((x, y - 0.03, z), (radius - 0.03, tall - 0.02, radius - 0.03))
+    dome = ellipsoid((x, y, z), (radius, tall, radius), colours.body).minus(inner, half_space((x, y, z), (0, 1, 0)))
     bulb = sphere((x, y + 0.25 * tall, z), p.uniform("bulb", 0.22, 0.45) * radius, colours.trim)
     holder = pillar((x, y + 0.25 * tall, z), y + 0.9 * tall, 0.03, colours.trim)
     if shade == "bowl":

@@ -1,8 +1,9 @@
-"""What a generator draws: numbers and choices under their names, and the colours of one shape."""
+"""Random parameters of a shape: named numbers and choices, and a palette of materials."""
 
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,11 +15,11 @@ __all__ = ["Palette", "Parameters", "random_palette"]
 
 
 class Parameters:
-    """Draws the parameters of a shape and keeps each under its name.
+    """Draws the parameters of a shape, and records each under its name.
 
     Attributes:
         choices: the discrete structure, by name.
-        counts: how many there are of a repeated part, by name.
+        counts: the numbers of repeated parts, by name.
         numbers: the continuous parameters, by name.
 
     Example:
@@ -40,36 +41,40 @@ class Parameters:
 
     def uniform(self, name: str, low: float, high: float) -> float:
         """A number between ``low`` and ``high``."""
-        self._fresh(name)
+        self._check_new(name)
         self.numbers[name] = float(self._generator.uniform(low, high))
         return self.numbers[name]
 
+    def uniforms(self, names: Sequence[str], limits: Sequence[tuple[float, float]]) -> list[float]:
+        """A number between the limits of each name, drawn in their order."""
+        return [self.uniform(name, low, high) for name, (low, high) in zip(names, limits, strict=True)]
+
     def choice(self, name: str, options: tuple[str, ...]) -> str:
-        """One of ``options``, each as likely as it is often named."""
-        self._fresh(name)
+        """One of ``options``, with probability proportional to how often it is listed."""
+        self._check_new(name)
         self.choices[name] = options[int(self._generator.integers(len(options)))]
         return self.choices[name]
 
     def count(self, name: str, low: int, high: int) -> int:
         """A whole number from ``low`` to ``high``, both included."""
-        self._fresh(name)
+        self._check_new(name)
         self.counts[name] = int(self._generator.integers(low, high + 1))
         return self.counts[name]
 
-    def _fresh(self, name: str) -> None:
-        # Two parameters of one name would be recorded as one.
+    def _check_new(self, name: str) -> None:
+        # Two parameters with the same name would be recorded as one.
         if name in self.numbers or name in self.choices or name in self.counts:
             raise OptionError(f"Parameters: {name!r} has been drawn already")
 
 
 class Palette(NamedTuple):
-    """The materials of one shape, one for each role: similar parts share one.
+    """The materials of one shape by role; similar parts share one.
 
     Attributes:
-        body: the largest parts.
-        trim: what stands out from them.
-        detail: small parts.
-        dark: tyres, screens, window panes.
+        body: of the largest parts.
+        trim: of parts that contrast with them.
+        detail: of small parts.
+        dark: of tyres, screens, window panes.
     """
 
     body: Material
@@ -79,7 +84,7 @@ class Palette(NamedTuple):
 
 
 def random_palette(generator: np.random.Generator, textured: float = 0.12) -> Palette:
-    """Four materials in two to four colours; each but the dark one is textured with probability ``textured``."""
+    """Four materials in two to four colours; all but the dark one are textured with probability ``textured``."""
     body, trim, detail = (_colour(generator) for _ in range(3))
     if generator.random() < 0.3:
         detail = trim
@@ -91,7 +96,7 @@ def random_palette(generator: np.random.Generator, textured: float = 0.12) -> Pa
 
 
 def _colour(generator: np.random.Generator) -> tuple[float, float, float]:
-    """A paint, a wood or a grey; none so dark that its shading cannot be seen."""
+    """The colour of a paint, a wood or a grey; bright enough for visible shading."""
     kind, hue, first, second = generator.random(4)
     if kind < 0.5:
         red, green, blue = colorsys.hsv_to_rgb(hue, 0.35 + 0.55 * first, 0.6 + 0.4 * second)

@@ -1,4 +1,4 @@
-"""Parts that several categories share. Lengths are in the category's own unit; the front is +x, up is +y."""
+"""Parts used by several categories. Lengths are in the category's own unit; the front is +x, up is +y."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def block(low: Vector, high: Vector, material: Material) -> Solid:
 
 
 def slab(low: Pair, high: Pair, half: float, material: Material) -> Solid:
-    """The box between two corners (x, y) that reaches ``half`` to either side of z = 0."""
+    """The box between two corners (x, y) that extends ``half`` to either side of z = 0."""
     return block((*low, -half), (*high, half), material)
 
 
@@ -60,7 +60,7 @@ def rod(start: Point, end: float, radius: float, material: Material) -> Solid:
 
 
 def bar(start: Vector, end: Vector, width: float, depth: float, material: Material) -> Solid:
-    """A sheared box that leads from one point to another one at another height: its ends lie flat.
+    """A sheared box from one point to another at a different height, with horizontal ends.
 
     ``width`` is measured along x, ``depth`` along z.
     """
@@ -70,14 +70,14 @@ def bar(start: Vector, end: Vector, width: float, depth: float, material: Materi
 
 
 def wing(root: Vector, tip: Vector, root_chord: float, tip_chord: float, thickness: float, material: Material) -> Solid:
-    """A wing or fin of one thickness whose chord runs along x, between the middles of its two chords.
+    """A wing or fin of constant thickness, between the midpoints of its two chords, which are along x.
 
-    The thickness is measured along y, or along z where the wing stands upright.
+    The thickness is along y, or along z for an upright fin.
     """
     root, tip = np.asarray(root, dtype=np.float64), np.asarray(tip, dtype=np.float64)
     upright = abs(tip[1] - root[1]) > abs(tip[2] - root[2])
     thin = np.array([0.0, 0.0, 1.0] if upright else [0.0, 1.0, 0.0])
-    # A sheared box along the trailing edge, of which the leading edge is cut off: so a box around it stays small.
+    # A sheared box along the trailing edge, with the leading edge cut off, has a small bounding box.
     reach, chord = np.array([root_chord / 2, 0, 0]), np.array([tip_chord / 2, 0, 0])
     middles = (root, tip - chord + reach)
     matrix = np.stack((reach, (middles[1] - root) / 2, thickness / 2 * thin, (root + middles[1]) / 2), 1)
@@ -88,12 +88,12 @@ def wing(root: Vector, tip: Vector, root_chord: float, tip_chord: float, thickne
 
 
 def kept(solid: Solid, point: Vector, towards: Vector) -> Solid:
-    """What lies on the side of the plane through ``point`` to which ``towards`` points."""
+    """The part of a solid on the side of the plane through ``point`` to which ``towards`` points."""
     return solid.minus(half_space(point, towards))
 
 
 def below(solid: Solid, first: tuple[float, float], second: tuple[float, float], *, axis: int = 2) -> Solid:
-    """What lies below the plane that holds coordinate ``axis`` and two points (x, y), or (z, y) for axis 0."""
+    """The part of a solid below the plane along ``axis`` through two points (x, y), or (z, y) for axis 0."""
     along, up = second[0] - first[0], second[1] - first[1]
     down = (up, -along) if along > 0 else (-up, along)
     if axis == 2:
@@ -102,19 +102,19 @@ def below(solid: Solid, first: tuple[float, float], second: tuple[float, float],
 
 
 def pair(*solids: Solid) -> list[Solid]:
-    """Parts, and the same parts mirrored to the other side, in the plane z = 0."""
+    """Parts, and the same parts mirrored in the plane z = 0."""
     return [*solids, *(solid.mirrored(2) for solid in solids)]
 
 
 def spaced(low: float, high: float, count: int) -> list[float]:
-    """The middles of ``count`` equal pieces of an interval."""
+    """The centres of ``count`` equal pieces of an interval."""
     return [low + (index + 0.5) * (high - low) / count for index in range(count)]
 
 
 def rack(
     low: Vector, high: Vector, axis: int, count: int, material: Material, filling: float | None = None
 ) -> list[Solid]:
-    """Slats: a box cut into ``count`` bars along ``axis``, of which each fills ``filling`` of its share."""
+    """Slats: a box split into ``count`` bars along ``axis``; each fills ``filling`` of its piece."""
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     share = (high[axis] - low[axis]) / count
     slats = []
@@ -143,7 +143,7 @@ def window(low: Vector, high: Vector, axis: int, width: float, material: Materia
 def spokes(
     hub: Vector, radius: float, drop: float, count: int, width: float, material: Material, *, turn: float = 0.0
 ) -> list[Solid]:
-    """Rods that leave a hub outwards in all directions and end ``drop`` lower: star feet, tripods."""
+    """Rods from a hub outwards in all directions, with ends ``drop`` lower: star feet, tripods."""
     hub = np.asarray(hub, dtype=np.float64)
     angles = np.deg2rad(turn) + 2 * np.pi * np.arange(count) / count
     ends = (hub + np.array([radius * np.cos(a), -drop, radius * np.sin(a)]) for a in angles)
@@ -151,7 +151,7 @@ def spokes(
 
 
 def ring(points: Iterable[Vector], radius: float, material: Material) -> list[Solid]:
-    """Rods along a chain of points, each a little longer than its piece, so that bends are closed."""
+    """Rods along a chain of points, each a little longer than its piece to close the bends."""
     chain = [np.asarray(point, dtype=np.float64) for point in points]
     rods = []
     for first, second in pairwise(chain):
@@ -163,13 +163,13 @@ def ring(points: Iterable[Vector], radius: float, material: Material) -> list[So
 def tube(start: Vector, end: Vector, start_radius: float, end_radius: float, wall: float, material: Material) -> Solid:
     """A frustum hollow from end to end: lamp shades, horns."""
     start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
-    over = (end - start) * 1e-3  # no coincident faces between a part and what is cut out of it
+    over = (end - start) * 1e-3  # no coincident faces of a part and its cut
     outer = cone(start, end, start_radius, end_radius, material)
     return outer.minus(cone(start - over, end + over, start_radius - wall, end_radius - wall))
 
 
 def wheel(center: Vector, radius: float, width: float, tyre: Material, hub: Material) -> list[Solid]:
-    """A wheel that rolls along x, with a hub cap that stands out on both sides."""
+    """A wheel that rolls along x, with a hub cap that protrudes on both sides."""
     center = np.asarray(center, dtype=np.float64)
     across = np.array([0.0, 0.0, width / 2])
     return [

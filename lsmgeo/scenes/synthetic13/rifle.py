@@ -42,11 +42,8 @@ def _stock(p: Parameters, stock: str, colours: Palette, height: float, width: fl
     """What goes to the shoulder, behind x = 0."""
     if stock == "none":
         return [rod((-0.03, 0, 0), 0.01, 0.4 * height, colours.trim)]
-    long, drop, butt = (
-        p.uniform("stock_length", 0.2, 0.34),
-        p.uniform("stock_drop", 0.01, 0.08),
-        p.uniform("butt_height", 0.09, 0.15),
-    )
+    long, drop = p.uniform("stock_length", 0.2, 0.34), p.uniform("stock_drop", 0.01, 0.08)
+    butt = p.uniform("butt_height", 0.09, 0.15)
     low, up = -drop - butt / 2, -drop + butt / 2
     pad = slab((-long - 0.025, low), (-long, up), 0.55 * width, colours.dark)
     if stock in ("wooden", "thumbhole"):
@@ -81,16 +78,8 @@ def _grip(p: Parameters, stock: str, colours: Palette, height: float, width: flo
     """The pistol grip, unless the stock is the grip, and the trigger's guard."""
     place, depth = p.uniform("grip_place", 0.1, 0.25) * length, p.uniform("grip_length", 0.08, 0.13)
     low = -height / 2
-    guard = ring(
-        [
-            (place + 0.03, low, 0),
-            (place + 0.035, low - 0.035, 0),
-            (place + 0.085, low - 0.035, 0),
-            (place + 0.09, low, 0),
-        ],
-        0.013,
-        colours.dark,
-    )
+    bend = ((0.03, low), (0.035, low - 0.035), (0.085, low - 0.035), (0.09, low))
+    guard = ring([(place + x, y, 0) for x, y in bend], 0.013, colours.dark)
     if stock == "wooden":
         return guard
     lean = p.uniform("grip_lean", 0.01, 0.05)
@@ -112,10 +101,8 @@ def _fore_end(
         return [body.minus(under.transformed(shear))]
     if form == "guard":
         tube = rod((length - 0.01, axis, 0), end, 0.55 * width + 0.006, colours.body)
-        bands = rack(
-            (length, axis - 0.7 * width, -0.7 * width), (end, axis + 0.7 * width, 0.7 * width), 0, 3, colours.dark, 0.25
-        )
-        return [tube, *bands]
+        first, last = (length, axis - 0.7 * width, -0.7 * width), (end, axis + 0.7 * width, 0.7 * width)
+        return [tube, *rack(first, last, 0, 3, colours.dark, 0.25)]
     if form == "pump":
         tube = rod((length - 0.01, axis - 0.042, 0), length + 0.9 * reach, 0.014, colours.dark)
         grip = rod((length + 0.3 * long, axis - 0.042, 0), length + 0.3 * long + 0.13, 0.026, colours.body)
@@ -125,22 +112,15 @@ def _fore_end(
     handle = p.choice("front_grip", ("none", "upright"))
     if handle == "none":
         return [body]
-    return [
-        body,
-        pillar((length + 0.6 * long, axis - 0.12, 0), axis - 0.02, 0.018, colours.dark),
-    ]
+    return [body, pillar((length + 0.6 * long, axis - 0.12, 0), axis - 0.02, 0.018, colours.dark)]
 
 
 def _magazine(p: Parameters, colours: Palette, length: float, height: float, width: float) -> list[Solid]:
     form = p.choice("magazine", ("none", "box", "curved", "curved", "drum"))
     if form == "none":
         return []
-    place, low, deep = (
-        p.uniform("magazine_place", 0.6, 0.85) * length,
-        -height / 2,
-        p.uniform("magazine_length", 0.07, 0.16),
-    )
-    wide = p.uniform("magazine_width", 0.04, 0.065)
+    place, deep = p.uniform("magazine_place", 0.6, 0.85) * length, p.uniform("magazine_length", 0.07, 0.16)
+    wide, low = p.uniform("magazine_width", 0.04, 0.065), -height / 2
     if form == "box":
         return [bar((place + 0.1 * deep, low - deep, 0), (place, low + 0.01, 0), wide, 0.8 * width, colours.dark)]
     if form == "curved":
@@ -165,11 +145,8 @@ def _sight(
     if form == "none":
         return []
     if form == "scope":
-        long, size, up = (
-            p.uniform("scope_length", 0.16, 0.3),
-            p.uniform("scope_radius", 0.014, 0.02),
-            top + p.uniform("scope_height", 0.025, 0.045),
-        )
+        long, size = p.uniform("scope_length", 0.16, 0.3), p.uniform("scope_radius", 0.014, 0.02)
+        up = top + p.uniform("scope_height", 0.025, 0.045)
         x = 0.5 * length - 0.4 * long
         rings = [
             slab((x + share * long - 0.013, top - 0.005), (x + share * long + 0.013, up), 0.013, colours.trim)
@@ -197,11 +174,8 @@ def _sight(
         bar((x, top - 0.01, 0), (x + lean, top + rise, 0), 0.03, 0.026, colours.trim)
         for x, lean in ((0.15 * length, 0.01), (0.8 * length, -0.03))
     ]
-    return [
-        *posts,
-        slab((0.1 * length, top + rise - 0.026), (0.8 * length, top + rise), 0.014, colours.trim),
-        front,
-    ]
+    grip = slab((0.1 * length, top + rise - 0.026), (0.8 * length, top + rise), 0.014, colours.trim)
+    return [*posts, grip, front]
 
 
 def _muzzle(p: Parameters, colours: Palette, end: float, axis: float, radius: float) -> list[Solid]:

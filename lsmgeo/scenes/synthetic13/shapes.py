@@ -1,7 +1,7 @@
-"""Shapes by number: one seed and index give one shape, its lights and its views, in any order and in any set.
+"""Shapes by number: a seed and an index determine a shape, its lights and its views.
 
-Equal numbers give equal shapes on one installation. Elsewhere they may differ by rounding, with the LAPACK that numpy
-was built with, and altogether, should numpy ever change a stream.
+Equal numbers give equal shapes on one installation. Another installation may differ by rounding, with numpy's LAPACK,
+or entirely, if numpy changes a random stream.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ CLASS_SPLITS = {
 }
 """The two halves of the experiment that trains on some categories and tests on the others."""
 
-# No part is thinner than this, so that a grid of 64 voxels a side cannot miss one.
+# No part is thinner than this, so that a grid of 64 voxels per side cannot miss one.
 LEAST_THICKNESS = 0.026
-# By how much more than the one before it each part is grown: over a hundred roundings of a depth of 2 in float32; yet
-# of forty parts the last grows by a sixth of a pixel of 224.
+# By how much each part is grown more than the previous one: over a hundred roundings of a depth of 2 in float32, but
+# the last of forty parts grows by only a sixth of a pixel of a 224 pixel image.
 SEPARATION = 2e-5
-# The last number of the seed: what is drawn from the stream.
+# The last number of the seed: the purpose of the stream.
 GEOMETRY, COLOURS, LIGHTS, VIEWS, SPLIT = range(5)
 
 
@@ -63,8 +63,8 @@ class SyntheticShape(NamedTuple):
         category: one of `CATEGORIES`.
         structure: the discrete choices as "name=value", in the order they were made.
         parameters: the continuous parameters, by name, in the units of the category's generator.
-        counts: how many there are of a repeated part, by name.
-        scene: the parts, y up, facing +x; the box around them, before cuts, is centred and has a diagonal of 1.
+        counts: the numbers of repeated parts, by name.
+        scene: the parts, y up, facing +x; their bounding box without cuts is centred and has a diagonal of 1.
         lights: two or three distant lights and ambient light, float64.
     """
 
@@ -78,16 +78,16 @@ class SyntheticShape(NamedTuple):
 
 
 def shape(seed: int, index: int, category: str | None = None) -> SyntheticShape:
-    """One shape of the set, a function of the arguments alone.
+    """One shape of the set; it depends only on the arguments.
 
-    Faces of different parts do not coincide: each part is grown by a little more than the one before it in the list, so
-    of two that would share a surface the later one is seen, whatever the rounding.
+    Faces of different parts do not coincide: each part is grown by a little more than the previous one, so of two parts
+    with a common surface the later one is visible, regardless of rounding.
 
     Args:
         seed: the set, 0 <= seed < 2**32.
         index: the shape's number in the set, 0 <= index < 2**32.
-        category: one of `CATEGORIES`; None takes the categories in turn (``index % 13``), so that any first part of a
-            set has as many of each.
+        category: one of `CATEGORIES`; None cycles through the categories (``index % 13``), so that the
+            first shapes of a set have as many of each.
 
     Returns:
         The shape, with its appearance.
@@ -124,10 +124,10 @@ def shape(seed: int, index: int, category: str | None = None) -> SyntheticShape:
 
 
 def views(seed: int, index: int, count: int, size: int) -> CameraTensors:
-    """Cameras that look at a shape, drawn as in the LSM paper (Section 5): all around, and a little up or down.
+    """Cameras that look at a shape, drawn as in the LSM paper (Section 5): all around, from slightly above or below.
 
     Azimuths are uniform in [0, 360) degrees, elevations in [-20, 30]; the distance is 2 and the focal length
-    1.875 ``size``. The first views do not depend on how many are asked for.
+    1.875 ``size``. The first views do not depend on ``count``.
 
     Args:
         seed: the set, as in `shape`.
@@ -155,17 +155,17 @@ def views(seed: int, index: int, count: int, size: int) -> CameraTensors:
 
 
 def split(seed: int, index: int) -> str:
-    """The part of the set that a shape belongs to: "train", "val" or "test", with all its views.
+    """The split that a shape and all its views belong to: "train", "val" or "test".
 
-    A hash of (seed, index), uniform to 2**-64, falls in ten classes: seven train, one val, two test. So the parts have
-    0.7, 0.1 and 0.2 of the shapes on average, and a larger set keeps every shape where it was.
+    A hash of (seed, index) modulo ten: seven classes are train, one is val, two are test. So the splits have 0.7, 0.1
+    and 0.2 of the shapes on average, and do not change when a set grows.
 
     Args:
         seed: the set, as in `shape`.
         index: the shape's number in the set.
 
     Returns:
-        The name of the part.
+        The name of the split.
 
     Raises:
         OptionError: a number out of range.
@@ -182,8 +182,8 @@ def split(seed: int, index: int) -> str:
 def random_lights(generator: np.random.Generator) -> Lights:
     """Two or three distant lights, mostly from above, and ambient light, all nearly white.
 
-    A white surface that faces all lights at once would get 1.05 to 1.3 of full brightness; of a white sphere about one
-    hundredth clips.
+    A white surface that faces all lights would have 1.05 to 1.3 of full brightness; about one hundredth of a white
+    sphere is clipped.
 
     Args:
         generator: the source of randomness.
@@ -234,7 +234,7 @@ def _normalised(parts: list[Solid]) -> list[Solid]:
 
 
 def _thickened(part: Solid, least: float) -> Solid:
-    """The part with its semi-axes raised to half of ``least``, about its own centre; its cuts stay."""
+    """The part with semi-axes of at least half of ``least``, about its own centre; its cuts stay."""
     left, sizes, right = np.linalg.svd(part.world_from_local[:, :3])
     if sizes[-1] >= least / 2:
         return part
@@ -243,15 +243,15 @@ def _thickened(part: Solid, least: float) -> Solid:
 
 
 def _grown(part: Solid, distance: float) -> Solid:
-    """The part with its faces moved outwards by ``distance``, and its cuts so that what they open stays open.
+    """The part with its faces moved outwards by ``distance``, and cuts adjusted so that openings stay open.
 
-    Flat faces and round cylinders move by exactly as much, whatever their size: so surfaces that coincide come apart
-    where the distances differ, and parts that touch overlap. Bounded cuts grow as the faces do that they open; of a
-    half-space that clips, the part keeps more.
+    Flat faces and round cylinders move by exactly ``distance``, whatever their size: coincident surfaces separate if
+    their distances differ, and touching parts overlap. Bounded cuts grow like the faces they open; half-spaces clip
+    less.
     """
     cuts = tuple(_grown(cut, -distance if cut.kind is Kind.HALF_SPACE else distance) for cut in part.cuts)
     inverse = np.linalg.inv(part.world_from_local[:, :3])
-    # A row is the gradient of a local coordinate: the faces at -1 and 1 are 1 / its length away from the centre.
+    # A row is the gradient of a local coordinate: its faces are at a distance of 1 / length from the centre.
     lengths = np.linalg.norm(inverse, axis=1)
     if part.kind is Kind.HALF_SPACE:
         return part.moved(distance / lengths[1] * inverse[1])

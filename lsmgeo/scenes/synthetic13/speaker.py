@@ -55,13 +55,10 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     if kind == "radio":
         return _radio(p, rim, colours, dish, proud)
 
-    tall, wide, deep = (
-        p.uniform(name, *limits) for name, limits in zip(("height", "width", "depth"), BOXES[kind], strict=True)
-    )
+    tall, wide, deep = p.uniforms(("height", "width", "depth"), BOXES[kind])
     x, z = deep / 2, wide / 2
-    shape = p.choice(
-        "shape", ("square", "sloped", "tapered") if kind in ("bookshelf", "tower", "stage box") else ("square",)
-    )
+    upright = kind in ("bookshelf", "tower", "stage box")
+    shape = p.choice("shape", ("square", "sloped", "tapered") if upright else ("square",))
     body = slab((-x, 0), (x, tall), z, colours.body)
     if shape == "sloped":
         body = below(body, (-x, p.uniform("slope", 0.7, 0.9) * tall), (x, tall))
@@ -98,11 +95,8 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
         parts += _driver(rim, colours, (front if shape == "square" else x, share * tall, 0), size, dish, proud)
     if kind == "bookshelf" and p.choice("port", ("none", "slot")) == "slot":
         slot = slab((x - 0.15, 0.03), (x + 0.1, 0.08), 0.6 * z, colours.dark)
-        parts = (
-            [part.minus(slot) for part in parts[:2]] + parts[2:]
-            if shape == "square"
-            else [parts[0].minus(slot), *parts[1:]]
-        )
+        through = 2 if shape == "square" else 1
+        parts = [part.minus(slot) for part in parts[:through]] + parts[through:]
     feet = ("none", "feet", "plinth", "stand") if kind == "bookshelf" else ("none", "feet", "plinth")
     foot = p.choice("foot", feet) if kind != "stage box" else "tripod"
     return parts + _foot(p, foot, colours, x, z)
@@ -137,11 +131,8 @@ def _foot(p: Parameters, foot: str, colours: Palette, x: float, z: float) -> lis
     pole, radius = p.uniform("pole_height", 0.5, 1.0), p.uniform("pole_radius", 0.025, 0.05)
     post = pillar((0, -pole, 0), 0.05, radius, colours.detail)
     if foot == "stand":
-        return [
-            post,
-            slab((-x, -pole), (x, -pole + 0.04), z, colours.detail),
-            slab((-0.8 * x, -0.03), (0.8 * x, 0.01), 0.8 * z, colours.detail),
-        ]
+        plate = slab((-0.8 * x, -0.03), (0.8 * x, 0.01), 0.8 * z, colours.detail)
+        return [post, slab((-x, -pole), (x, -pole + 0.04), z, colours.detail), plate]
     return [post, *spokes((0, -0.45 * pole, 0), 0.55 * pole, 0.55 * pole, 3, 0.045, colours.detail)]
 
 
@@ -174,10 +165,8 @@ def _ball(p: Parameters, rim: str, colours: Palette, dish: float, proud: float) 
     radius, flat = p.uniform("radius", 0.25, 0.4), p.uniform("flattening", 0.7, 1.0)
     size, cut = p.uniform("woofer", 0.5, 0.75) * radius, p.uniform("front_cut", 0.55, 0.75) * radius
     ball = ellipsoid((0, 0, 0), (radius, flat * radius, radius), colours.body)
-    parts = [
-        ball.minus(half_space((cut, 0, 0), (-1, 0, 0))),
-        *_driver(rim, colours, (cut, 0, 0), 0.8 * size, dish, proud),
-    ]
+    ball = ball.minus(half_space((cut, 0, 0), (-1, 0, 0)))
+    parts = [ball, *_driver(rim, colours, (cut, 0, 0), 0.8 * size, dish, proud)]
     foot, spread = p.choice("foot", ("ring", "stem", "tripod")), p.uniform("foot_spread", 0.6, 1.0) * radius
     bottom = -flat * radius
     rise = p.uniform("rise", 0.1, 0.7)
@@ -208,19 +197,9 @@ def _horn(p: Parameters, colours: Palette) -> list[Solid]:
         neck = ring([(-0.12, tall - 0.02, 0), (-0.2, tall + 0.15, 0), at], 0.045, colours.trim)
         disc = pillar((0.05, tall - 0.01, 0), tall + 0.03, 0.4 * wide, colours.dark)
         plinth = slab((-wide / 2 - 0.03, 0), (wide / 2 + 0.03, 0.05), wide / 2 + 0.03, colours.trim)
-        crank = ring(
-            [(0, tall / 2, wide / 2), (0, tall / 2, wide / 2 + 0.1), (0, tall / 2 - 0.12, wide / 2 + 0.1)],
-            0.02,
-            colours.dark,
-        )
-        return [
-            *horn,
-            *neck,
-            disc,
-            plinth,
-            *crank,
-            slab((-wide / 2, 0), (wide / 2, tall), wide / 2, colours.trim),
-        ]
+        bend = [(0, tall / 2, wide / 2), (0, tall / 2, wide / 2 + 0.1), (0, tall / 2 - 0.12, wide / 2 + 0.1)]
+        body = slab((-wide / 2, 0), (wide / 2, tall), wide / 2, colours.trim)
+        return [*horn, *neck, disc, plinth, *ring(bend, 0.02, colours.dark), body]
     driver = rod((-0.2, 0, 0), -0.05, 1.8 * throat, colours.dark)
     parts = [part.rotated(2, 0.5 * tilt) for part in (*horn, driver)]
     post = pillar((0, -0.5 - tall, 0), 0, 0.04, colours.detail)
@@ -232,23 +211,17 @@ def _radio(p: Parameters, rim: str, colours: Palette, dish: float, proud: float)
     tall, wide, deep = p.uniform("height", 0.4, 0.6), p.uniform("width", 0.9, 1.4), p.uniform("depth", 0.2, 0.35)
     rise = p.uniform("handle_height", 0.08, 0.22)
     x, z, size = deep / 2, wide / 2, min(0.38 * tall, 0.2 * wide)
-    handle = [
-        (0, tall - 0.03, 0.75 * z),
-        (0, tall + rise, 0.65 * z),
-        (0, tall + rise, -0.65 * z),
-        (0, tall - 0.03, -0.75 * z),
-    ]
+    ends = ((tall - 0.03, 0.75 * z), (tall + rise, 0.65 * z), (tall + rise, -0.65 * z), (tall - 0.03, -0.75 * z))
+    handle = ring([(0, y, z) for y, z in ends], 0.025, colours.trim)
     left = _driver(rim, colours, (x, 0.45 * tall, z - 1.25 * size), size, dish, proud)
-    panel = slab(
-        (x - 0.02, 0.2 * tall), (x + 0.02, p.uniform("panel", 0.5, 0.7) * tall), 0.25 * wide - 0.05, colours.detail
-    )
-    parts = [slab((-x, 0), (x, tall), z, colours.body), *pair(*left), panel, *ring(handle, 0.025, colours.trim)]
+    high = p.uniform("panel", 0.5, 0.7) * tall
+    panel = slab((x - 0.02, 0.2 * tall), (x + 0.02, high), 0.25 * wide - 0.05, colours.detail)
+    parts = [slab((-x, 0), (x, tall), z, colours.body), *pair(*left), panel, *handle]
     knob = p.uniform("knob", 0.025, 0.045)
     parts += [rod((x - 0.02, 0.85 * tall, place), x + 0.04, knob, colours.trim) for place in (-0.1, 0.0, 0.1)]
     if p.choice("antenna", ("up", "none")) == "up":
-        parts.append(
-            cylinder((-0.5 * x, tall - 0.02, -0.8 * z), (-0.5 * x, tall + 0.5, -1.0 * z), 0.018, colours.detail)
-        )
+        foot, tip = (-0.5 * x, tall - 0.02, -0.8 * z), (-0.5 * x, tall + 0.5, -1.0 * z)
+        parts.append(cylinder(foot, tip, 0.018, colours.detail))
     return parts
 
 

@@ -1,4 +1,4 @@
-"""How varied a category is, in numbers."""
+"""Measures of the variety of a category."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class Measured(NamedTuple):
     """The variety of one category over a number of shapes.
 
     Attributes:
-        structures: how many different structures were met.
-        parameters: how many different continuous parameters were met.
-        fewest: continuous parameters of the shape that has the fewest.
+        structures: number of different structures.
+        parameters: number of different continuous parameters.
+        fewest: least number of continuous parameters of a shape.
         parts: mean number of solids.
-        fill: mean share of the voxels that are occupied.
-        iou: mean intersection over union of the occupancies of two shapes, over all pairs.
+        fill: mean fraction of occupied voxels.
+        iou: mean intersection over union of the occupancy of two shapes, over all pairs.
     """
 
     structures: int
@@ -41,10 +41,10 @@ def measure(category: str, *, count: int = 40, seed: int = 0, size: int = 32) ->
         category: one of `CATEGORIES`.
         count: number of shapes, at least 2: those of index 0 to count - 1.
         seed: the set.
-        size: voxels a side.
+        size: voxels per side.
 
     Returns:
-        The numbers of `Measured`.
+        The measures.
 
     Raises:
         OptionError: an unknown category.
@@ -57,7 +57,7 @@ def measure(category: str, *, count: int = 40, seed: int = 0, size: int = 32) ->
     """
     (count,) = check_size("measure", "count", (count,), 1, "an integer")
     if count < 2:
-        raise ShapeError(f"measure: count must be at least 2, or there is no pair; got {count}")
+        raise ShapeError(f"measure: count must be at least 2, to have a pair; got {count}")
     shapes = [shape(seed, index, category) for index in range(count)]
     volumes = voxels([item.scene for item in shapes], size).flatten(1).float()
     shared, sizes = volumes @ volumes.T, volumes.sum(1)

@@ -7,7 +7,7 @@ what is below the top (nothing, apron, shelf, drawer, stretcher), a taper.
 
 from __future__ import annotations
 
-from lsmgeo.scenes.primitives import Solid, box, cone, half_space, sphere
+from lsmgeo.scenes.primitives import Material, Solid, box, cone, half_space, sphere
 from lsmgeo.scenes.synthetic13.parameters import Palette, Parameters
 from lsmgeo.scenes.synthetic13.parts import bar, block, pair, pillar, slab, spokes, window
 
@@ -66,41 +66,9 @@ def _base(
     """What carries the top, from y = 0 to ``floor``."""
     up, material = floor + 0.02, colours.trim
     if base in ("four legs", "splayed legs"):
-        form = p.choice("leg", ("square", "round", "tapered"))
-        out = p.uniform("leg_spread", 0.06, 0.2) if base == "splayed legs" else 0.0
-        ends = [
-            ((s * (near + out / 2), 0, side + out / 2), (s * (near - out / 2), up, side - out / 2)) for s in (-1, 1)
-        ]
-        if form == "square":
-            return pair(*(bar(foot, head, width, width, material) for foot, head in ends))
-        narrow = p.uniform("leg_taper", 0.35, 0.7) if form == "tapered" else 1.0
-        return pair(
-            *(cone(head, foot, 0.55 * width, max(0.55 * narrow * width, 0.022), material) for foot, head in ends)
-        )
+        return _legs(p, base, material, up, near, side, width)
     if base in ("column", "star"):
-        post, reach = p.uniform("column_radius", 0.035, 0.1), p.uniform("foot_reach", 0.5, 0.85) * min(near, side)
-        column = pillar((0, 0.02, 0), up, post, material)
-        collar = pillar((0, floor - 0.1, 0), up, post, colours.detail, min(2.5 * post, 0.9 * near))
-        if base == "column":
-            return [
-                column,
-                collar,
-                pillar((0, 0, 0), 0.05, reach + post, material),
-                pillar((0, 0.04, 0), 0.2 * floor, 0.6 * reach + post, material, post),
-            ]
-        return [
-            column,
-            collar,
-            *spokes(
-                (0, 0.3 * floor, 0),
-                reach + post,
-                0.3 * floor - 0.03,
-                p.count("feet", 3, 5),
-                min(width, 0.08),
-                material,
-                turn=45,
-            ),
-        ]
+        return _column(p, base, colours, floor, near, side, width)
     if base == "trestle":
         reach, place = p.uniform("trestle_reach", 0.7, 1.1) * near, 0.85 * side
         cross = [
@@ -110,50 +78,72 @@ def _base(
     if base == "panels":
         shrink = p.uniform("panel_depth", 0.6, 1.0) * near
         panel = block((-shrink, 0, side - 0.02), (shrink, up, side + 0.5 * width), material)
-        return [
-            *pair(panel),
-            box((0, p.uniform("beam_height", 0.3, 0.8) * floor, 0), (0.05, 0.15 * floor, 2 * side), colours.detail),
-        ]
+        height = p.uniform("beam_height", 0.3, 0.8) * floor
+        return [*pair(panel), box((0, height, 0), (0.05, 0.15 * floor, 2 * side), colours.detail)]
     if base == "sled":
         height = p.uniform("rail_height", 0.3, 0.8) * floor
         rail = box((0, height, 0), (0.05, p.uniform("rail_width", 0.04, 0.1), 2 * side), colours.detail)
         posts = pair(block((-0.03, 0, side - width / 3), (0.03, up, side + width / 3), material))
-        return [
-            *pair(*window((-near, 0, side - width / 2), (near, up, side + width / 2), 2, 0.8 * width, material)),
-            rail,
-            *posts,
-        ]
+        frame = window((-near, 0, side - width / 2), (near, up, side + width / 2), 2, 0.8 * width, material)
+        return [*pair(*frame), rail, *posts]
     if base == "drum":
         wide, waist = p.uniform("drum_radius", 0.5, 0.9), p.uniform("drum_taper", 0.4, 1.0)
         scale = (wide * near, 1.0, wide * side)
         start, end = (0.0, up) if p.choice("taper", ("up", "down")) == "up" else (up, 0.0)
         return [pillar((0, start, 0), end, 1.0, material, waist).scaled(scale)]
-    # A desk: drawers under one or both ends.
+    return _desk(p, colours, floor, near, side, width)
+
+
+def _legs(
+    p: Parameters, base: str, material: Material, up: float, near: float, side: float, width: float
+) -> list[Solid]:
+    """Four legs, straight or splayed."""
+    form = p.choice("leg", ("square", "round", "tapered"))
+    out = p.uniform("leg_spread", 0.06, 0.2) if base == "splayed legs" else 0.0
+    ends = [((s * (near + out / 2), 0, side + out / 2), (s * (near - out / 2), up, side - out / 2)) for s in (-1, 1)]
+    if form == "square":
+        return pair(*(bar(foot, head, width, width, material) for foot, head in ends))
+    narrow = p.uniform("leg_taper", 0.35, 0.7) if form == "tapered" else 1.0
+    return pair(*(cone(head, foot, 0.55 * width, max(0.55 * narrow * width, 0.022), material) for foot, head in ends))
+
+
+def _column(
+    p: Parameters, base: str, colours: Palette, floor: float, near: float, side: float, width: float
+) -> list[Solid]:
+    """A column on a round foot, or on the feet of a star."""
+    material = colours.trim
+    post, reach = p.uniform("column_radius", 0.035, 0.1), p.uniform("foot_reach", 0.5, 0.85) * min(near, side)
+    column = pillar((0, 0.02, 0), floor + 0.02, post, material)
+    collar = pillar((0, floor - 0.1, 0), floor + 0.02, post, colours.detail, min(2.5 * post, 0.9 * near))
+    if base == "column":
+        foot = pillar((0, 0, 0), 0.05, reach + post, material)
+        return [column, collar, foot, pillar((0, 0.04, 0), 0.2 * floor, 0.6 * reach + post, material, post)]
+    hub, drop, count = (0, 0.3 * floor, 0), 0.3 * floor - 0.03, p.count("feet", 3, 5)
+    return [column, collar, *spokes(hub, reach + post, drop, count, min(width, 0.08), material, turn=45)]
+
+
+def _desk(p: Parameters, colours: Palette, floor: float, near: float, side: float, width: float) -> list[Solid]:
+    """Drawers below one or both ends, legs below the other."""
+    up, material = floor + 0.02, colours.trim
     under = p.choice("pedestals", ("both", "left", "right"))
     wide, lift = p.uniform("pedestal_width", 0.25, 0.42) * side, p.uniform("pedestal_clearance", 0.0, 0.12)
     parts: list[Solid] = []
     for s in (-1, 1):
-        inner, outer = sorted((s * side, s * (side - 2 * wide)))
-        if under == "both" or (under == "left") == (s > 0):
-            parts.append(block((-near, lift, inner), (near, up, outer), material))
-            rows = 3
-            for row in range(rows):
-                low, tall = lift + 0.02 + row * (floor - lift) / rows, (floor - lift) / rows - 0.04
-                parts.append(
-                    block((near - 0.01, low, inner + 0.03), (near + 0.02, low + tall, outer - 0.03), colours.body)
-                )
-                parts.append(sphere((near + 0.03, low + tall / 2, (inner + outer) / 2), 0.02, colours.detail))
-            if lift > 0.03:
-                parts += [
-                    block(
-                        (t * (near - 0.05) - 0.025, 0, inner + 0.02),
-                        (t * (near - 0.05) + 0.025, lift + 0.01, outer - 0.02),
-                        colours.detail,
-                    )
-                    for t in (-1, 1)
-                ]
-        else:
+        if under != "both" and (under == "left") != (s > 0):
             parts += [bar((t * near, 0, s * side), (t * near, up, s * side), width, width, material) for t in (-1, 1)]
+            continue
+        inner, outer = sorted((s * side, s * (side - 2 * wide)))
+        parts.append(block((-near, lift, inner), (near, up, outer), material))
+        rows = 3
+        for row in range(rows):
+            low, tall = lift + 0.02 + row * (floor - lift) / rows, (floor - lift) / rows - 0.04
+            front = (near - 0.01, low, inner + 0.03), (near + 0.02, low + tall, outer - 0.03)
+            parts.append(block(*front, colours.body))
+            parts.append(sphere((near + 0.03, low + tall / 2, (inner + outer) / 2), 0.02, colours.detail))
+        if lift > 0.03:
+            for x in (0.05 - near, near - 0.05):
+                feet = (x - 0.025, 0, inner + 0.02), (x + 0.025, lift + 0.01, outer - 0.02)
+                parts.append(block(*feet, colours.detail))
     return parts
 
 

@@ -27,9 +27,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
         return _flip(p, keys, colours)
     tall = 1.0
     wide = p.uniform("width", 0.36, 0.62) if kind != "brick" else p.uniform("width", 0.28, 0.42)
-    thick = (
-        p.uniform("thickness", 0.07, 0.16) if kind not in ("brick", "cordless") else p.uniform("thickness", 0.16, 0.32)
-    )
+    thick = p.uniform("thickness", *((0.16, 0.32) if kind in ("brick", "cordless") else (0.07, 0.16)))
     if kind == "keyboard":
         tall, wide = wide, 1.0
     z, x = wide / 2, thick / 2
@@ -54,10 +52,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
         disc, level = p.uniform("wheel", 0.07, 0.13), p.uniform("wheel_height", 0.64, 0.78) * tall
         parts.append(block((x - 0.02, low, 0.55 * half[0]), (x + 0.012, tall - margin, 0.55 * half[1]), colours.dark))
         parts += _keys(p, keys, colours, x, (margin, low - 0.04 * tall), half, (3, 6))
-        return [
-            *parts,
-            *pair(rod((x - 0.01, level, 0.8 * z), x + 0.03, disc * tall, colours.trim)),
-        ]
+        return parts + pair(rod((x - 0.01, level, 0.8 * z), x + 0.03, disc * tall, colours.trim))
     if kind == "slider":
         slide, chin = p.uniform("slide", 0.25, 0.5), p.uniform("chin", 0.14, 0.26)
         button = p.uniform("button", 0.3, 0.45) * chin
@@ -136,9 +131,8 @@ def _flip(p: Parameters, keys: str, colours: Palette) -> list[Solid]:
     ]
     hinge = cylinder((-x, 0, -z), (-x, 0, z), 0.7 * thick, colours.trim)
     lean = 0.5 * opening
-    parts = [part.rotated(2, lean, (-x, 0, 0)) for part in lower] + [
-        part.rotated(2, -lean, (-x, 0, 0)) for part in upper
-    ]
+    halves = ((lower, lean), (upper, -lean))
+    parts = [part.rotated(2, angle, (-x, 0, 0)) for half, angle in halves for part in half]
     if p.choice("antenna", ("none", "stub")) == "stub":
         long = p.uniform("antenna_length", 0.08, 0.2)
         parts.append(cylinder((-x, 0, z - 0.06), (-x - 0.2 * long, long + 0.1, z - 0.06), 0.035, colours.dark))
@@ -180,35 +174,20 @@ def _with_handset(p: Parameters, kind: str, keys: str, colours: Palette) -> list
         turned = [part.rotated(1, 90).rotated(2, -slope) for part in handset]
         parts += [part.moved((0, (low + high) / 2 + 0.07, place)) for part in turned]
         level = (low + high) / 2
-        cord = [
-            (x - 0.05, level * 0.6, place),
-            (x + 0.12, 0.06, place - 0.02),
-            (x + 0.1, 0.03, 0),
-            (x - 0.05, 0.03, 0.05),
-        ]
-        return parts + ring(cord, 0.02, colours.dark)
+        start, bend = (x - 0.05, level * 0.6, place), (x + 0.12, 0.06, place - 0.02)
+        return parts + ring([start, bend, (x + 0.1, 0.03, 0), (x - 0.05, 0.03, 0.05)], 0.02, colours.dark)
     size = (p.uniform("dial", 0.28, 0.36) if kind == "rotary" else 0.34) * min(run, wide)
     dial = [
         rod((-0.05, 0.42 * run, 0), 0.04, size, colours.detail),
         rod((0, 0.42 * run, 0), 0.065, 0.42 * size, colours.body),
     ]
-    angles = np.deg2rad(np.linspace(-30, 240, 8))
-    dial += [
-        cylinder(
-            (0, 0.42 * run + 0.72 * size * np.sin(a), 0.72 * size * np.cos(a)),
-            (0.055, 0.42 * run + 0.72 * size * np.sin(a), 0.72 * size * np.cos(a)),
-            0.15 * size,
-            colours.dark,
-        )
-        for a in angles
-    ]
-    face = (
-        laid(dial)
-        if kind == "rotary"
-        else laid(_keys(p, keys, colours, 0.0, (0.12 * run, 0.62 * run), (-0.6 * z, 0.6 * z), (4, 3)))
-    )
+    for a in np.deg2rad(np.linspace(-30, 240, 8)):
+        hole = (0, 0.42 * run + 0.72 * size * np.sin(a), 0.72 * size * np.cos(a))
+        dial.append(rod(hole, 0.055, 0.15 * size, colours.dark))
+    if kind != "rotary":
+        dial = _keys(p, keys, colours, 0.0, (0.12 * run, 0.62 * run), (-0.6 * z, 0.6 * z), (4, 3))
     rest = pair(block((-0.85 * x, high - 0.12, 0.35 * z), (-0.35 * x, high + 0.17, 0.5 * z), colours.body))
-    parts += [*face, *rest, *(part.moved((-0.6 * x, high + 0.14, 0)) for part in handset)]
+    parts += [*laid(dial), *rest, *(part.moved((-0.6 * x, high + 0.14, 0)) for part in handset)]
     if kind == "rotary":
         return parts
     # A wall telephone is the same thing stood up, its base to the wall.

@@ -35,7 +35,7 @@ SHAPES = {
 def build(p: Parameters, colours: Palette) -> list[Solid]:
     """The parts of one vessel, 1 long; its deck is at y = 0."""
     kind = p.choice("kind", tuple(SHAPES))
-    beam, draught = (p.uniform(name, *limits) for name, limits in zip(("beam", "draught"), SHAPES[kind], strict=True))
+    beam, draught = p.uniforms(("beam", "draught"), SHAPES[kind])
     if kind == "submarine":
         return _submarine(p, colours, beam)
     # What stands near the ends of a tug or a container ship would hang over a round hull.
@@ -47,45 +47,26 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
         hulls = [part.moved((0, 0, apart)) for part in hull]
         hulls += [part.moved((0, 0, -apart)) for part in hull]
         deck = slab((-0.4, -0.02), (0.12, 0.025), apart + z, colours.trim)
-        cabin = below(
-            slab((-0.3, 0), (0.1, p.uniform("cabin_height", 0.08, 0.14)), 0.7 * apart, colours.trim),
-            (-0.05, 0.15),
-            (0.12, 0.0),
-        )
+        house = slab((-0.3, 0), (0.1, p.uniform("cabin_height", 0.08, 0.14)), 0.7 * apart, colours.trim)
+        cabin = below(house, (-0.05, 0.15), (0.12, 0.0))
         rods = [bar((0.15, 0, 0), (0.15, 0.02, 0), 0.03, 2 * apart, colours.detail)]
         return [*hulls, deck, cabin, *rods, *_rig(p, colours, 0.12, "one")]
     if kind in ("sailing boat", "ketch"):
-        cabin = ellipsoid(
-            (-0.05, 0, 0),
-            (p.uniform("cabin_length", 0.14, 0.24), p.uniform("cabin_height", 0.05, 0.09), 0.6 * z),
-            colours.trim,
-        )
-        keel = wing(
-            (0, -0.9 * draught, 0),
-            (-0.05, -draught - p.uniform("keel", 0.05, 0.15), 0),
-            0.2,
-            0.12,
-            0.03,
-            colours.detail,
-        )
-        return [
-            *hull,
-            cabin,
-            keel,
-            *_rig(p, colours, p.uniform("mast_place", 0.05, 0.15), "one" if kind == "sailing boat" else "two"),
-        ]
+        radii = (p.uniform("cabin_length", 0.14, 0.24), p.uniform("cabin_height", 0.05, 0.09), 0.6 * z)
+        cabin = ellipsoid((-0.05, 0, 0), radii, colours.trim)
+        root, tip = (0, -0.9 * draught, 0), (-0.05, -draught - p.uniform("keel", 0.05, 0.15), 0)
+        keel, mast = wing(root, tip, 0.2, 0.12, 0.03, colours.detail), p.uniform("mast_place", 0.05, 0.15)
+        return [*hull, cabin, keel, *_rig(p, colours, mast, "one" if kind == "sailing boat" else "two")]
     if kind == "rowing boat":
         return _rowing_boat(p, colours, hull, beam, draught)
-    return [
-        *hull,
-        *{
-            "container ship": _containers,
-            "cruise ship": _decks,
-            "tug": _tug,
-            "speedboat": _speedboat,
-            "warship": _warship,
-        }[kind](p, colours, z),
-    ]
+    upper = {
+        "container ship": _containers,
+        "cruise ship": _decks,
+        "tug": _tug,
+        "speedboat": _speedboat,
+        "warship": _warship,
+    }
+    return [*hull, *upper[kind](p, colours, z)]
 
 
 def _hull(p: Parameters, bow: str, colours: Palette, beam: float, draught: float) -> list[Solid]:
@@ -114,18 +95,13 @@ def _rig(p: Parameters, colours: Palette, place: float, masts: str) -> list[Soli
     tall, boom = p.uniform("mast_height", 0.7, 1.25), p.uniform("boom", 0.3, 0.48)
     rise, foresail = p.uniform("boom_height", 0.1, 0.16), p.choice("foresail", ("jib", "none", "jib"))
     parts: list[Solid] = []
-    for x, height, reach in (
-        ((place, tall, boom),) if masts == "one" else ((place, tall, 0.7 * boom), (place - 0.42, 0.65 * tall, 0.16))
-    ):
-        sail = below(
-            slab((x - reach, rise), (x, 0.96 * height), 0.013, colours.detail),
-            (x - reach, rise),
-            (x - 0.02, 0.96 * height),
-        )
+    two = (place, tall, 0.7 * boom), (place - 0.42, 0.65 * tall, 0.16)
+    for x, height, reach in ((place, tall, boom),) if masts == "one" else two:
+        sail = slab((x - reach, rise), (x, 0.96 * height), 0.013, colours.detail)
         parts += [
             pillar((x, -0.05, 0), height, 0.014, colours.trim),
             rod((x - reach - 0.01, rise, 0), x, 0.014, colours.trim),
-            sail,
+            below(sail, (x - reach, rise), (x - 0.02, 0.96 * height)),
         ]
     if foresail == "jib":
         level = p.uniform("jib_height", 0.6, 0.9) * tall
@@ -188,19 +164,15 @@ def _decks(p: Parameters, colours: Palette, z: float) -> list[Solid]:
     for level in range(p.count("decks", 3, 5)):
         rear, bow, side = start + level * step, front - 1.3 * level * step, z * (0.95 - 0.06 * level)
         parts.append(slab((rear, y - 0.005), (bow, y + storey), side, colours.trim))
-        parts.append(
-            slab((rear + 0.01, y + 0.3 * storey), (bow + 0.004, y + 0.75 * storey), side + 0.004, colours.dark)
-        )
+        low, high = (rear + 0.01, y + 0.3 * storey), (bow + 0.004, y + 0.75 * storey)
+        parts.append(slab(low, high, side + 0.004, colours.dark))
         y += storey
     rise, size = p.uniform("funnel_height", 0.07, 0.13), p.uniform("funnel_radius", 0.022, 0.04)
     count = p.count("funnels", 1, 4)
     for x in spaced(start + 5 * step, front - 7 * step, count) if front - start > 13 * step else [(start + front) / 2]:
-        parts += [
-            cylinder((x, y - 0.01, 0), (x - 0.3 * rise, y + rise, 0), size, colours.detail),
-            cylinder(
-                (x - 0.27 * rise, y + 0.85 * rise, 0), (x - 0.33 * rise, y + 1.05 * rise, 0), 1.06 * size, colours.dark
-            ),
-        ]
+        base, top = (x - 0.27 * rise, y + 0.85 * rise, 0), (x - 0.33 * rise, y + 1.05 * rise, 0)
+        parts.append(cylinder((x, y - 0.01, 0), (x - 0.3 * rise, y + rise, 0), size, colours.detail))
+        parts.append(cylinder(base, top, 1.06 * size, colours.dark))
     mast = cylinder((0.3, -0.01, 0), (0.29, 0.2, 0), 0.013, colours.detail)
     return [*parts, mast]
 
@@ -209,17 +181,12 @@ def _tug(p: Parameters, colours: Palette, z: float) -> list[Solid]:
     """A wheelhouse, a funnel and fenders."""
     place, tall = p.uniform("house_place", -0.05, 0.12), p.uniform("house_height", 0.14, 0.24)
     long, top = p.uniform("house_length", 0.2, 0.32), p.uniform("wheelhouse", 0.1, 0.17)
-    rise = p.uniform("mast_height", 0.15, 0.35)
+    rise, eaves = p.uniform("mast_height", 0.15, 0.35), tall + 0.5 * top
     parts = [
         slab((place - long, -0.01), (place + 0.4 * long, 0.55 * tall), 0.65 * z, colours.trim),
         slab((place - 0.3 * long, 0.5 * tall), (place + 0.3 * long, tall + 0.5 * top), 0.5 * z, colours.trim),
         slab((place - 0.31 * long, tall - 0.02), (place + 0.32 * long, tall + 0.3 * top), 0.52 * z, colours.dark),
-        slab(
-            (place - 0.36 * long, tall + 0.5 * top - 0.01),
-            (place + 0.38 * long, tall + 0.5 * top + 0.025),
-            0.58 * z,
-            colours.body,
-        ),
+        slab((place - 0.36 * long, eaves - 0.01), (place + 0.38 * long, eaves + 0.025), 0.58 * z, colours.body),
         cylinder((place - 0.7 * long, 0.3 * tall, 0), (place - 0.75 * long, tall + 0.12, 0), 0.05, colours.detail),
         pillar((place, tall, 0), tall + top + rise, 0.014, colours.detail),
         box((place, tall + top + 0.7 * rise, 0), (0.026, 0.026, 0.9 * z), colours.detail),
@@ -249,24 +216,13 @@ def _speedboat(p: Parameters, colours: Palette, z: float) -> list[Solid]:
         ]
         return parts
     long = p.uniform("cabin_length", 0.3, 0.45)
-    house = below(
-        slab((place - long, -0.01), (place, tall + 0.02), 0.7 * z, colours.trim),
-        (place - lean, tall + 0.02),
-        (place, 0.0),
-    )
+    house = slab((place - long, -0.01), (place, tall + 0.02), 0.7 * z, colours.trim)
+    house = below(house, (place - lean, tall + 0.02), (place, 0.0))
     panes = slab((place - 0.9 * long, 0.35 * tall), (place - lean, 0.85 * tall), 0.72 * z, colours.dark)
     upper = slab((place - 0.85 * long, tall + 0.01), (place - 1.5 * lean, tall + 0.05), 0.55 * z, colours.body)
     roof = slab((place - 0.8 * long, tall + 0.14), (place - 1.5 * lean - 0.02, tall + 0.17), 0.5 * z, colours.trim)
-    posts = [
-        bar(
-            (place - s * long - lean, tall, 0.4 * z),
-            (place - s * long - lean, tall + 0.15, 0.4 * z),
-            0.026,
-            0.026,
-            colours.detail,
-        )
-        for s in (0.25, 0.5)
-    ]
+    places = (place - s * long - lean for s in (0.25, 0.5))
+    posts = [bar((x, tall, 0.4 * z), (x, tall + 0.15, 0.4 * z), 0.026, 0.026, colours.detail) for x in places]
     return [*parts, house, panes, upper, roof, *pair(*posts)]
 
 
@@ -283,21 +239,9 @@ def _warship(p: Parameters, colours: Palette, z: float) -> list[Solid]:
             block((place - 0.07, 0.02, 1.1 * z), (place + 0.07, 0.02 + 0.7 * tall, 1.6 * z), colours.body),
             block((place - 0.02, 0.5 * tall, 1.2 * z), (place + 0.05, 1.1 * tall, 1.5 * z), colours.detail),
         ]
-        planes = [
-            part
-            for x in (-0.35, -0.22, 0.2)
-            for part in (
-                box((x, 0.05, -1.2 * z), (0.09, 0.03, 0.026), colours.detail),
-                box((x, 0.05, -1.2 * z), (0.03, 0.026, 0.09), colours.detail),
-            )
-        ]
-        return [
-            deck,
-            strip,
-            *island,
-            *planes,
-            pillar((place, tall, 1.35 * z), tall + mast, 0.013, colours.dark),
-        ]
+        sizes = (0.09, 0.03, 0.026), (0.03, 0.026, 0.09)
+        planes = [box((x, 0.05, -1.2 * z), size, colours.detail) for x in (-0.35, -0.22, 0.2) for size in sizes]
+        return [deck, strip, *island, *planes, pillar((place, tall, 1.35 * z), tall + mast, 0.013, colours.dark)]
     parts = [
         slab((place - long / 2, -0.01), (place + long / 2, 0.4 * tall), 0.8 * z, colours.trim),
         slab((place - 0.1 * long, 0.3 * tall), (place + 0.4 * long, tall), 0.6 * z, colours.trim),
@@ -308,13 +252,9 @@ def _warship(p: Parameters, colours: Palette, z: float) -> list[Solid]:
     ]
     ahead, behind = place + long / 2, place - long / 2
     for x, y, turn in ((ahead + 0.17, 0.0, 0), (ahead + 0.07, 0.035, 0), (behind - 0.1, 0.0, 180)):
-        gun = [
-            pillar((0, -0.04, 0), 0.035, size, colours.detail),
-            *(
-                cylinder((0, 0.02, s * 0.4 * size), (3.2 * size, 0.035, s * 0.4 * size), 0.013, colours.dark)
-                for s in (-1, 1)
-            ),
-        ]
+        gun = [pillar((0, -0.04, 0), 0.035, size, colours.detail)]
+        for side in (-0.4 * size, 0.4 * size):
+            gun.append(cylinder((0, 0.02, side), (3.2 * size, 0.035, side), 0.013, colours.dark))
         parts += [part.rotated(1, turn).moved((x, y, 0)) for part in gun]
     return parts
 
@@ -339,16 +279,8 @@ def _submarine(p: Parameters, colours: Palette, beam: float) -> list[Solid]:
         pillar((place, radius, 0), radius + tall + 0.1, 0.014, colours.dark),
         pillar((place - 0.06, radius, 0), radius + tall + 0.06, 0.014, colours.dark),
     ]
-    sail_planes = pair(
-        wing(
-            (place, radius + 0.6 * tall, 0),
-            (place - 0.01, radius + 0.6 * tall, 1.6 * radius),
-            0.07,
-            0.05,
-            0.028,
-            colours.detail,
-        )
-    )
+    root, tip = (place, radius + 0.6 * tall, 0), (place - 0.01, radius + 0.6 * tall, 1.6 * radius)
+    sail_planes = pair(wing(root, tip, 0.07, 0.05, 0.028, colours.detail))
     screw = [box((-0.52, 0, 0), (0.026, 1.5 * radius, 0.035), colours.detail).rotated(0, turn) for turn in (0, 60, 120)]
     return [
         rod((-0.2, 0, 0), 0.5 - nose, radius, colours.body),

@@ -1,7 +1,7 @@
-"""Solids in world coordinates, each with its textbook formulas, and the first hit of a ray with unions and differences.
+"""Primitives in world coordinates with textbook formulas, and first hits of rays with their unions and differences.
 
-Nothing is transformed to a canonical shape and no interval is kept: a ray's crossings with every surface are sorted,
-and the first stretch between two of them whose middle lies inside the scene begins the hit.
+There are no canonical primitives and no intervals: a ray's crossings with all surfaces are sorted, and the hit is the
+start of the first interval between two of them whose midpoint is inside the scene.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ Shape = HalfSpace | Faces | Ellipsoid | Frustum
 
 @dataclass(frozen=True)
 class Part:
-    """A shape less others."""
+    """A shape minus others."""
 
     shape: Shape
     cuts: tuple[Shape, ...] = ()
@@ -146,11 +146,11 @@ def holds(parts: list[Part], points: Array) -> npt.NDArray[np.bool_]:
 
 
 def first_hit(parts: list[Part], origins: Array, directions: Array) -> tuple[Array, Array, Array]:
-    """Where rays that begin outside enter a union of parts.
+    """Where rays from outside enter a union of parts.
 
     Returns:
-        ray parameter (N,), inf for a miss; the normal (N, 3) on the side that the ray comes from, 0 for a miss; and how
-        far (N,) the nearest other crossing is, in the ray's parameter: small at edges, where rounding decides.
+        ray parameter (N,), inf for a miss; the normal (N, 3) on the side of the ray's origin, 0 for a miss; and the
+        difference (N,) to the nearest other crossing in the ray parameter: small at edges, where rounding decides.
     """
     found = []
     with np.errstate(all="ignore"):

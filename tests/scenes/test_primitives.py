@@ -1,4 +1,4 @@
-"""Solids, materials and lights as values: what they are, and what is refused."""
+"""Solids, materials and lights as values, and errors of invalid ones."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def inside(solid: scenes.Solid, *points: tuple[float, float, float]) -> list[boo
     return scenes.occupancy([scenes.Scene([solid])], torch.tensor([points], dtype=torch.float64))[0].tolist()
 
 
-def test_solids_hold_what_they_say():
+def test_solids_contain_their_points():
     assert inside(scenes.box((1, 2, 3), (2, 4, 6)), (1.9, 3.9, 5.9), (2.1, 2, 3)) == [True, False]
     assert inside(scenes.ellipsoid((0, 0, 0), (1, 2, 3)), (0, 1.9, 0), (0, 0, 2.9), (0.9, 0.9, 0)) == [
         True,
@@ -37,13 +37,13 @@ def test_solids_hold_what_they_say():
     ]
     tapered = scenes.cone((0, 0, 0), (2, 0, 0), 1.0, 0.5)
     assert inside(tapered, (0.1, 0.9, 0), (1.9, 0.5, 0), (1.9, 0.9, 0)) == [True, True, False]
-    # The wider end may come second.
+    # The wider end may be second.
     widening = scenes.cone((0, 0, 0), (2, 0, 0), 0.5, 1.0)
     assert inside(widening, (0.1, 0.9, 0), (1.9, 0.9, 0)) == [False, True]
     assert inside(scenes.half_space((0, 1, 0), (0, 2, 0)), (5, 0.9, 5), (0, 1.1, 0)) == [True, False]
 
 
-def test_a_cut_takes_away_from_its_own_solid_alone():
+def test_a_cut_changes_only_its_own_solid():
     hole = scenes.cylinder((-1, 0, 0), (1, 0, 0), 0.2)
     drilled, whole = scenes.box((0, 0, 0), (1, 1, 1)).minus(hole), scenes.box((0, 0, 0.1), (0.1, 1, 1))
     assert inside(drilled, (0, 0, 0), (0, 0.3, 0)) == [False, True]
@@ -70,7 +70,7 @@ def test_moves_compose_as_matrices():
     assert inside(solid.mirrored(0), (-0.25, 0.2, 0.3), (0.25, 0.2, 0.3)) == [True, False]
 
 
-def test_voxels_of_a_ball_are_those_whose_centres_it_holds():
+def test_voxels_of_a_ball_are_those_with_centres_inside():
     found = scenes.voxels([scenes.Scene([scenes.sphere((0.1, 0, -0.05), 0.3)])], 16)[0]
     steps = -0.5 + (np.arange(16) + 0.5) / 16
     z, y, x = np.meshgrid(steps, steps, steps, indexing="ij")
@@ -78,7 +78,7 @@ def test_voxels_of_a_ball_are_those_whose_centres_it_holds():
 
 
 def colour_at(material: scenes.Material, y: float) -> np.ndarray:
-    """The albedo of a wall at height y, by ambient light alone."""
+    """The albedo of a wall at height y, from ambient light only."""
     wall = scenes.Scene([scenes.box((0, 0, 0), (1, 4, 4), material)])
     view = orbit(torch.zeros(1, 1), 0.0, 2.5, focal_length=9.0, height=1, width=1, target=(0, y, 0))
     ambient = scenes.Lights(torch.zeros(0, 3), torch.zeros(0, 3), torch.ones(3))
@@ -151,7 +151,7 @@ def test_batches_are_loops():
 
 
 def test_another_size_sees_the_same():
-    """K is resized for the size asked: the coarse picture's pixel is a fine pixel's centre at an odd ratio."""
+    """K is resized for the size: at an odd ratio a coarse pixel has the centre of a fine one."""
     coarse = scenes.render([BALL], VIEW, SUN).depth
     fine = scenes.render([BALL], VIEW, SUN, size=(27, 27)).depth
     torch.testing.assert_close(fine[..., 1::3, 1::3], coarse, rtol=1e-5, atol=1e-6)
@@ -176,13 +176,13 @@ def test_another_size_sees_the_same():
         (lambda: scenes.Material("red"), "three numbers"),
         (lambda: scenes.Material(seed=-1), "seed must be a whole number"),
         (lambda: BALL.transformed(np.eye(3)), "must be affine"),
-        (lambda: scenes.Scene([]), "one at least"),
-        (lambda: scenes.Scene(["ball"]), "must be Solids"),
+        (lambda: scenes.Scene([]), "at least one Solid"),
+        (lambda: scenes.Scene(["ball"]), "at least one Solid"),
         (lambda: BALL.solids[0].minus(BALL.solids[0].minus(BALL.solids[0])), "no cuts of their own"),
         (lambda: BALL.solids[0].minus(1), "must be Solids"),
     ],
 )
-def test_impossible_scenes_are_refused(make, words):
+def test_invalid_scenes_are_refused(make, words):
     with pytest.raises(OptionError, match=words):
         make()
 
@@ -191,7 +191,7 @@ def test_impossible_scenes_are_refused(make, words):
     ("call", "error", "words"),
     [
         (lambda: scenes.render(BALL, VIEW, SUN), OptionError, "sequence of Scene"),
-        (lambda: scenes.render([], VIEW, SUN), ShapeError, "one Scene at least"),
+        (lambda: scenes.render([], VIEW, SUN), ShapeError, "at least one Scene"),
         (lambda: scenes.render(None, VIEW, SUN), OptionError, "sequence of Scene"),
         (lambda: scenes.render([BALL], NO_VIEW, SUN), ShapeError, "V = 0"),
         (lambda: scenes.render([BALL, BALL], VIEW, SUN), ShapeError, "S = 2 scenes"),

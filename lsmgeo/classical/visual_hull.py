@@ -107,35 +107,41 @@ def visual_hull(
     expected = (len(maps[0]), len(maps)) if has_batch else (len(maps),)
     if leading != expected:
         raise ShapeError(f"{who}: cameras must have the leading shape {expected}, as masks; got {leading}")
-    scenes, views = len(maps[0]), len(maps)
-    _, height, width = grid.shape  # type: ignore[misc]
-    planes = max(1, memory // (BYTES_OF_A_SITE * scenes * height * width))
-    # What lies off every silhouette: 0, or the least that any mask says where masks are distances.
-    nothing = min(0.0, *(float(values.min()) for values in maps))
-    start = float("inf") if rule == "all" else 0.0
-    support = maps[0].new_full((scenes, *grid.shape), start)  # type: ignore[misc]
-    count = torch.zeros(support.shape, dtype=torch.int16) if outside == "unknown" else None
     with torch.no_grad():
-        # One view after another: its picture stays in the caches, and memory does not grow with the views.
-        for view, values in enumerate(maps):
-            camera = tensors.at((..., slice(view, view + 1)))
-            features = values[:, None, None]
-            for first, volume, visible in functional.unproject_slabs(
-                features, camera, grid, planes, padding_mode="border"
-            ):
-                said, seen = volume[:, 0, 0], visible[:, 0]
-                here = support[:, first : first + planes]
-                if count is not None:
-                    count[:, first : first + planes] += seen
-                elsewhere = nothing if outside == "empty" else start
-                said = torch.where(seen, said, elsewhere)
-                here.copy_(torch.minimum(here, said) if rule == "all" else here + said)
-    if rule == "mean":
-        support /= views if count is None else count.clamp_min(1)
-    if count is not None:
-        support[count == 0] = nothing
+        support = _support(maps, tensors, grid, rule, outside, memory)
     support = support if has_batch else support[0]
     return VisualHull(support > threshold, support)
+
+
+def _support(
+    maps: list[Tensor], cameras: CameraTensors, grid: VoxelGrid, rule: str, outside: str, memory: int
+) -> Tensor:
+    """The mean or least value (B, D, H, W) of the silhouettes at the voxels."""
+    scenes = len(maps[0])
+    _, height, width = grid.shape  # type: ignore[misc]
+    planes = max(1, memory // (BYTES_OF_A_SITE * scenes * height * width))
+    # The value off every silhouette: 0, or the least of the masks where these are distances.
+    nothing = min(0.0, *(float(values.min()) for values in maps))
+    start = float("inf") if rule == "all" else 0.0
+    elsewhere = nothing if outside == "empty" else start
+    support = maps[0].new_full((scenes, *grid.shape), start)  # type: ignore[misc]
+    count = torch.zeros(support.shape, dtype=torch.int16) if outside == "unknown" else None
+    # One view after another: its mask stays in the caches, and memory does not grow with the views.
+    for view, values in enumerate(maps):
+        camera = cameras.at((..., slice(view, view + 1)))
+        for first, volume, visible in functional.unproject_slabs(
+            values[:, None, None], camera, grid, planes, padding_mode="border"
+        ):
+            slab = support[:, first : first + planes]
+            if count is not None:
+                count[:, first : first + planes] += visible[:, 0]
+            values_here = torch.where(visible[:, 0], volume[:, 0, 0], elsewhere)
+            slab.copy_(torch.minimum(slab, values_here) if rule == "all" else slab + values_here)
+    if rule == "mean":
+        support /= len(maps) if count is None else count.clamp_min(1)
+    if count is not None:
+        support[count == 0] = nothing
+    return support
 
 
 def _maps_of_views(who: str, masks: Tensor | Sequence[Tensor]) -> list[Tensor]:

@@ -28,8 +28,7 @@ def evaluate(
 ) -> int:
     """Make a table or figure of the paper from trained models: printed, and written as JSON, CSV and images.
 
-    The shapes are the test shapes of shards, or of synthetic-13, which are rendered on demand. How a model was trained
-    is read from its file.
+    How a model was trained is read from its file.
 
     Args:
         checkpoints: weights, checkpoints or run folders of lsmgeo train, separated by commas, each PATH or NAME=PATH,

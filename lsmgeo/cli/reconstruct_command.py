@@ -3,9 +3,24 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Literal
 
 __all__ = ["reconstruct"]
+
+TITLES = {"hull": "visual hull", "sweep": "plane sweep"}
+SILHOUETTE, LEARNT = ("hull", "v-lsm", "d-lsm"), ("v-lsm", "d-lsm")
+# The methods of the options whose default is None: given with another method, they are errors.
+METHODS = {
+    "masks": SILHOUETTE,
+    "background": SILHOUETTE,
+    "near": ("sweep",),
+    "far": ("sweep",),
+    "density": ("sweep",),
+    "weights": LEARNT,
+    "box": LEARNT,
+}
 
 
 def reconstruct(
@@ -33,114 +48,106 @@ def reconstruct(
     box: str | None = None,
     threshold: float = 0.4,
 ) -> int:
-    """Reconstruct posed photographs: depth maps, coloured points, a mesh, and a page to turn it around in.
+    """Reconstruct posed images: depth maps, coloured points, a mesh, and a page with an interactive model.
 
     Args:
-        scene: posed photographs in any form that lsmgeo reads.
-        method: "sweep" is plane-sweep stereo, "hull" the visual hull of silhouettes; "v-lsm" and "d-lsm" are learnt:
-            voxels, and depth maps.
-        view: a photograph, its number (by name, from 0) or its name: sweep this one alone; a hull is looked at from
-            there, and a learnt model reads it first. By default all are swept, checked against each other and fused.
-        out: folder for the results; created where it does not exist.
-        neighbours: for sweeps, number of other photographs to match with.
-        size: longer side in pixels at which photographs are used.
+        scene: posed images in any form that lsmgeo reads.
+        method: "sweep" is plane-sweep stereo, "hull" the visual hull of silhouettes; "v-lsm" and "d-lsm" are learnt,
+            for voxels and depth maps.
+        view: number (by name, from 0) or name of an image: only this one is swept, a hull is shown from there first,
+            and it is the first input of a learnt model. By default all are swept, checked against each other and fused.
+        out: folder for the results; created if it does not exist.
+        neighbours: for sweeps, number of other images to match with.
+        size: longer side in pixels at which images are used.
         planes: for sweeps, number of depth planes.
-        spacing: for sweeps, what is even between planes; with "disparity" a step is a pixel, and their number follows.
-        near: for sweeps, nearest depth in world units; by default told from the scene.
+        spacing: for sweeps, what is even between planes; with "disparity" a step is a pixel, which sets their number.
+        near: for sweeps, nearest depth in world units; by default inferred from the scene.
         far: for sweeps, farthest depth.
         score: for sweeps, how patches are compared.
         window: for sweeps, side of the patches in pixels.
-        density: for sweeps, largest fraction of the pixels to keep; by default 0.8, or 0.4 of one view alone.
+        density: for sweeps, largest fraction of the pixels to keep; by default 0.8, or 0.4 of one view only.
         check: for the sweep of one view, how many of its neighbours are swept too; they must agree with it. 0 takes a
             third of the time.
-        resolution: voxels along the longest side of the box in which the mesh is made.
-        rule: for hulls, whether a voxel must lie in "all" silhouettes, or in three quarters of them ("mean"), which
-            forgives wrong ones.
+        resolution: voxels along the longest side of the box of the mesh.
+        rule: for hulls, whether a voxel must be within "all" silhouettes, or within three quarters of them ("mean"),
+            which tolerates wrong ones.
         masks: for hulls and learnt models, a folder of silhouettes; by default alpha, or a folder masks or silhouettes
-            beside the photographs.
-        background: for hulls and learnt models, the colour behind the object, which then tells the silhouettes,
-            whatever else could: white, black, or three numbers such as 0.1,0.8,0.2.
-        memory: for sweeps, MiB that one may take.
-        weights: for learnt models, a file of weights, a checkpoint or a run folder of lsmgeo train.
-        views: for learnt models, how many photographs are used at most, from all around.
-        box: for learnt models, where the object is: x,y,z,side of a cube in world units; by default told from
+            beside the images.
+        background: for hulls and learnt models, the colour of the background, from which silhouettes are computed; it
+            takes precedence. White, black, or three numbers such as 0.1,0.8,0.2.
+        memory: for sweeps, MiB that one may use.
+        weights: for learnt models, weights, a checkpoint or a run folder of lsmgeo train.
+        views: for learnt models, the largest number of images to use, from all around.
+        box: for learnt models, x,y,z,side of a cube around the object in world units; by default inferred from
             silhouettes, sparse points or the cameras.
-        threshold: for v-lsm, the probability from which a voxel is solid.
+        threshold: for v-lsm, the probability from which a voxel is occupied.
 
     Returns:
-        The exit status: 0, or 1 where nothing could be told.
+        The exit status: 0, or 1 if nothing was reconstructed.
     """
-    import os
-    import time
-    from pathlib import Path
+    sweep = {"neighbours": neighbours, "planes": planes, "spacing": spacing, "near": near, "far": far, "score": score}
+    sweep |= {"window": window, "density": density, "memory": memory << 20, "check": check}
+    silhouettes = {"masks": masks, "background": background}
+    learnt = silhouettes | {"weights": weights, "views": views, "box": box, "threshold": threshold}
+    options = {"sweep": sweep, "hull": silhouettes | {"rule": rule}}.get(method, learnt | {"method": method})
+    _check_options(method, sweep | learnt)
+    _check_folder(out)
+    return _reconstruct(scene, view, Path(out), method, options | {"resolution": resolution, "size": size})
 
-    from lsmgeo import data
-    from lsmgeo.classical.sweep_options import SweepOptions
+
+def _check_options(method: str, given: dict[str, Any]) -> None:
     from lsmgeo.errors import OptionError
-    from lsmgeo.reconstruct.hull_method import hull_results
-    from lsmgeo.reconstruct.sweep_method import readable, sweep_results
+
+    for option, methods in METHODS.items():
+        if given[option] is not None and method not in methods:
+            raise OptionError(f"{option} is for method {', '.join(methods)}; got method {method}")
+
+
+def _check_folder(out: str) -> None:
+    """Before the work, not after it."""
+    import os
+
+    from lsmgeo.errors import OptionError
+
+    existing = next(path for path in (Path(out).resolve(), *Path(out).resolve().parents) if os.path.exists(path))
+    if not os.path.isdir(existing) or not os.access(existing, os.W_OK | os.X_OK):
+        raise OptionError(f"out must be a folder that can be written or created; got {out!r}")
+
+
+def _reconstruct(path: str, view: int | str | None, out: Path, method: str, options: dict[str, Any]) -> int:
+    """Open the scene, run the method, write and print the results."""
+    import time
+
+    from lsmgeo.reconstruct.scene_input import open_scene
     from lsmgeo.reconstruct.write_results import write_results
 
-    learnt = ("v-lsm", "d-lsm")
-    for option, value, methods in (
-        ("masks", masks, ("hull", *learnt)),
-        ("background", background, ("hull", *learnt)),
-        ("near", near, ("sweep",)),
-        ("far", far, ("sweep",)),
-        ("density", density, ("sweep",)),
-        ("weights", weights, learnt),
-        ("box", box, learnt),
-    ):
-        if value is not None and method not in methods:
-            raise OptionError(f"{option} is for method {', '.join(methods)}; got method {method}")
     start = time.perf_counter()
-    images = data.open(scene)
-    name = images.names[view] if isinstance(view, int) and 0 <= view < len(images) else view
-    if name is not None and name not in images.names:
-        named = "" if isinstance(view, int) else " or be a photograph's name"
-        raise OptionError(f"view must lie in 0..{len(images) - 1}{named}; got {view!r}")
-    if any(path.resolve().is_relative_to(Path(out).resolve()) for path in images.paths):
-        raise OptionError(f"out must be a folder without the photographs, which it could replace; got {out!r}")
-    # Told before the work, not after.
-    there = next(str(path) for path in (Path(out).resolve(), *Path(out).resolve().parents) if os.path.exists(path))
-    if not os.path.isdir(there) or not os.access(there, os.W_OK | os.X_OK):
-        raise OptionError(f"out must be a folder that can be written or made; got {out!r}")
-    images, left_out = readable(images)
-    if name is not None and name not in images.names:
-        raise OptionError(f"view must be a photograph that can be read: {left_out[0]}")
-    reference = None if name is None else images.names.index(str(name))
-    title = {"hull": "visual hull", "sweep": "plane sweep"}.get(method, method.upper())
-    title = f"{Path(scene).resolve().name}, {title}{'' if name is None else f', from {name}'}"
-    masked: dict[str, Any] = {"masks": masks, "background": background, "resolution": resolution, "size": size}
-    if method == "hull":
-        results = hull_results(images, reference, title, rule=rule, **masked)
-    elif method in learnt:
-        from lsmgeo.reconstruct.learnt_method import learnt_results
-
-        masked |= {"method": method, "weights": weights, "views": views, "box": box, "threshold": threshold}
-        results = learnt_results(images, reference, title, **masked)
-    else:
-        options = SweepOptions(
-            neighbours=neighbours,
-            size=size,
-            planes=planes,
-            spacing=spacing,
-            near=near,
-            far=far,
-            score=score,
-            window=window,
-            density=density,
-            memory=memory << 20,
-            who="reconstruct",
-        )
-        results = sweep_results(images, reference, title, options, check=check, resolution=resolution)
+    scene, index, notes = open_scene(path, view, out)
+    title = f"{Path(path).resolve().name}, {TITLES.get(method, method.upper())}"
+    if index is not None:
+        title += f", from {scene.names[index]}"
+    results = _function_of(method)(scene, index, title, **options)
     facts = (*results.facts, ("time", f"{time.perf_counter() - start:.1f} s"))
-    results = results._replace(facts=facts, notes=left_out + results.notes)
-    written = write_results(images, results, out)
+    results = results._replace(facts=facts, notes=notes + results.notes)
+    written = write_results(scene, results, out)
     for fact, value in results.facts:
         print(f"{fact + ':':<13}{value}")
-    for what, path in written.items():
-        print(f"{what + ':':<18}{path.resolve()}")
+    for what, file in written.items():
+        print(f"{what + ':':<18}{file.resolve()}")
     for note in results.notes:
         print(f"lsmgeo: warning: {note}", file=sys.stderr)
     return 0 if len(results.points) or results.mesh is not None else 1
+
+
+def _function_of(method: str) -> Callable[..., Any]:
+    if method == "sweep":
+        from lsmgeo.reconstruct.sweep_method import sweep_results
+
+        return sweep_results
+    if method == "hull":
+        from lsmgeo.reconstruct.hull_method import hull_results
+
+        return hull_results
+    from lsmgeo.reconstruct.learnt_method import learnt_results
+
+    return learnt_results

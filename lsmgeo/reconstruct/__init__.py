@@ -1,1 +1,1 @@
-"""Posed images to depth maps, points, a mesh and a page to turn them around in: each method, and what is written."""
+"""From posed images to depth maps, points, a mesh and an interactive page: the methods, and the result files."""

@@ -1,4 +1,4 @@
-"""From posed photographs with silhouettes to the surface of the visual hull, in the photographs' colours."""
+"""Reconstruction by the visual hull: from silhouettes to a surface in the colours of the images."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from lsmgeo.classical.tsdf import voxel_side
 from lsmgeo.classical.visual_hull import RULES, default_grid, visual_hull
 from lsmgeo.data.meshes import Mesh
 from lsmgeo.errors import OptionError
-from lsmgeo.reconstruct.sweep_method import mesh_facts, named_colour
-from lsmgeo.reconstruct.write_results import Looked, Results
+from lsmgeo.reconstruct.scene_input import named_colour
+from lsmgeo.reconstruct.write_results import Results, ViewResult, mesh_facts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
     from lsmgeo.grids import VoxelGrid
 
-__all__ = ["colour_vertices", "hull_depth", "hull_results", "outline_iou"]
+__all__ = ["colour_vertices", "hull_depth", "hull_results", "silhouette_iou"]
 
-# Planes along a ray for every voxel that it crosses, and sites that are looked at in one go.
+# Planes along a ray for every voxel that it crosses, and sites per slab.
 PLANES_PER_VOXEL, SITES = 1.0, 1 << 24
-# How far behind the hull's depth, in voxels, a vertex may lie and still be seen.
+# A vertex is visible up to so many voxels behind the depth of the hull.
 BEHIND = 2.0
 SPECK_FACES = 20
 
@@ -51,22 +51,22 @@ def hull_results(
     """Carve the visual hull of all silhouettes and colour its surface.
 
     Args:
-        scene: posed photographs.
-        view: the one from which the model is looked at first.
-        title: of what is written.
-        rule: "all", a solid that lies in every silhouette; or "mean", in three quarters of them, which forgives wrong
+        scene: posed images.
+        view: the view to start from in the page; None for the first.
+        title: of the page and the figures.
+        rule: "all" for a solid within every silhouette, "mean" within three quarters of them, which tolerates wrong
             silhouettes; see `lsmgeo.classical.visual_hull`.
         masks: folder of mask files, see `lsmgeo.classical.silhouettes`.
-        background: behind the object: "black", "white", or three numbers from 0 to 1 with commas between.
-        resolution: voxels along the longest side of the hull's box.
-        size: longer side of the silhouettes in pixels; never larger than the photographs.
+        background: the colour of the background: "black", "white", or three numbers from 0 to 1, separated by commas.
+        resolution: voxels along the longest side of the box of the hull.
+        size: longer side of the silhouettes in pixels; never larger than that of the images.
 
     Returns:
-        `Results`; depth is where a ray first meets the hull, certain are the photographs' silhouettes.
+        `Results`; depth is where a ray first meets the hull, confidence is the silhouette.
 
     Raises:
-        OptionError: no silhouettes are there, one is empty, or nothing projects into all of them.
-        DataError: a photograph or a mask cannot be read.
+        OptionError: there are no silhouettes, one is empty, or nothing projects into all of them.
+        DataError: an image or a mask cannot be read.
     """
     who = "reconstruct"
     check_choice(who, "rule", rule, RULES)
@@ -83,48 +83,48 @@ def hull_results(
             raise OptionError(f"{who}: the silhouette of view {number} ({scene.names[number]}) is empty")
     shape = fitted(scene.size(0), size)
     cameras = resize(scene.cameras, *shape)
-    outlines = torch.stack([resized(mask[None].float(), shape)[0] > 0.5 for mask in found])
-    grid = default_grid(outlines, cameras, resolution)
-    border = outlines.clone()
+    small_masks = torch.stack([resized(mask[None].float(), shape)[0] > 0.5 for mask in found])
+    grid = default_grid(small_masks, cameras, resolution)
+    border = small_masks.clone()
     border[:, 1:-1, 1:-1] = False
-    # An object that is cut off by a picture's border goes on beyond it.
+    # An object that is cut off by the border of an image continues beyond it.
     outside = "unknown" if bool(border.any()) else "empty"
-    soft = torch.stack([signed_distance(mask) for mask in outlines]) if rule == "all" else outlines.float()
+    soft = torch.stack([signed_distance(mask) for mask in small_masks]) if rule == "all" else small_masks.float()
     level = {"all": 0.0, "mean": 0.75}[rule]
     hull = visual_hull(soft, cameras, grid, rule=rule, threshold=level, outside=outside)
     if not bool(hull.occupancy.any()):
-        raise OptionError(f"{who}: no voxel lies in the silhouettes; rule='mean' forgives wrong ones")
-    looked, ious = [], []
-    for number, mask in enumerate(tqdm(outlines, desc="hull", unit="view", disable=None)):
+        raise OptionError(f"{who}: no voxel is within the silhouettes; rule='mean' tolerates wrong ones")
+    views, ious = [], []
+    for number, mask in enumerate(tqdm(small_masks, desc="hull", unit="view", disable=None)):
         camera, image = cameras.at(number), resized(scene.load(number), shape)
         depth = hull_depth(hull.occupancy, grid, camera)
-        ious.append(outline_iou(depth, mask))
+        ious.append(silhouette_iou(depth, mask))
         numbers = (("IoU of silhouette and hull", f"{ious[-1]:.3f}"),)
-        looked.append(Looked(number, image, camera, depth, mask.float(), "silhouette", numbers))
+        views.append(ViewResult(number, image, camera, depth, mask.float(), "silhouette", numbers))
     mesh = drop_specks(extract_mesh(hull.support, grid, level=level), SPECK_FACES)
-    mesh = colour_vertices(mesh, looked, BEHIND * voxel_side(grid))
+    mesh = colour_vertices(mesh, views, BEHIND * voxel_side(grid))
     z, y, x = hull.occupancy.shape
     volume = 100 * float(hull.occupancy.float().mean())
     facts = (
-        ("scene", f"{len(scene)} photographs, {scene.source}"),
+        ("scene", f"{len(scene)} images, {scene.source}"),
         ("hull", f"of {len(ious)} silhouettes, {x} x {y} x {z} voxels (x, y, z), {volume:.1f} % inside"),
-        ("silhouettes", f"IoU with the hull's own {np.mean(ious):.3f} on average, {min(ious):.3f} at least"),
+        ("silhouettes", f"IoU with those of the hull {np.mean(ious):.3f} on average, {min(ious):.3f} at least"),
         *mesh_facts(mesh),
     )
     notes: tuple[str, ...] = ()
     worst = int(np.argmin(ious))
     if ious[worst] < 0.8:
         notes = (
-            f"The silhouette of {scene.names[worst]} and the hull have an IoU of {ious[worst]:.2f} alone. Where the "
-            "silhouette holds more than the object, that is background, and harmless; where the hull lacks a piece of "
-            "it, another silhouette or a camera is wrong, which --rule mean forgives.",
+            f"The silhouette of {scene.names[worst]} and the hull have an IoU of only {ious[worst]:.2f}. Background in "
+            "the silhouette does no harm; where a part of the object is missing from the hull, another silhouette or a "
+            "camera is wrong, which --rule mean tolerates.",
         )
-    looked.sort(key=lambda one: view is not None and one.view != view)
-    return Results(title, facts, notes, tuple(looked), mesh=mesh)
+    views.sort(key=lambda one: view is not None and one.view != view)
+    return Results(title, facts, notes, tuple(views), mesh=mesh)
 
 
-def outline_iou(depth: Tensor, mask: Tensor) -> float:
-    """Intersection over union of where a solid is seen, by its depth (h, w), and of a silhouette."""
+def silhouette_iou(depth: Tensor, mask: Tensor) -> float:
+    """Intersection over union of the pixels with depth (h, w) and a silhouette."""
     return float(((depth > 0) & mask).sum()) / max(1, int(((depth > 0) | mask).sum()))
 
 
@@ -133,23 +133,23 @@ def hull_depth(occupancy: Tensor, grid: VoxelGrid, camera: CameraTensors) -> Ten
 
     Args:
         occupancy: (D, H, W) bool.
-        grid: where it lives.
+        grid: its grid.
         camera: leading shape ().
 
     Returns:
-        (h, w) float32, the camera's size; 0 where a ray meets none.
+        (h, w) float32, of the size of the camera; 0 where a ray meets none.
     """
     height, width = int(torch.as_tensor(camera.height)), int(torch.as_tensor(camera.width))
     depth = torch.zeros(height, width)
     index = occupancy.nonzero()
     if not len(index):
         return depth
-    # The corners of the box of occupied voxels bound their depth, and where they are seen.
+    # The corners of the box of occupied voxels bound their depths and pixels.
     ends = torch.stack([index.amin(0).flip(0) - 0.5, index.amax(0).flip(0) + 0.5]).double()
     T = grid.world_from_lattice.double()
     corners = torch.cartesian_prod(*ends.unbind(1)) @ T[:3, :3].T + T[:3, 3]
     pixels, z = (part[0, 0].numpy() for part in project(camera.at(None), corners[None])[:2])
-    # Of the shortest side, so that flat voxels are not stepped over.
+    # By the shortest side, so that no flat voxel is skipped.
     step = float(T[:3, :3].norm(dim=0).min()) / PLANES_PER_VOXEL
     nearest, farthest = float(z.min()), float(z.max())
     start = max(nearest, step) + step / 2
@@ -172,16 +172,15 @@ def hull_depth(occupancy: Tensor, grid: VoxelGrid, camera: CameraTensors) -> Ten
     return depth
 
 
-def colour_vertices(mesh: Mesh, views: Sequence[Looked], behind: float) -> Mesh:
-    """A mesh with the mean of the colours that its vertices have in the photographs that see them.
+def colour_vertices(mesh: Mesh, views: Sequence[ViewResult], behind: float) -> Mesh:
+    """A mesh whose vertices have the mean of their colours in the images in which they are visible.
 
-    A view counts by the fourth power of the cosine between its ray and the surface's normal, so that those that look
-    straight at a place decide.
+    The weight of a view is the fourth power of the cosine between its ray and the normal of the surface.
 
     Args:
         mesh: of any size.
-        views: photographs, cameras and depth of the same surface.
-        behind: how far behind a view's depth a vertex may lie and still be seen, in world units.
+        views: images, cameras and depth maps of the same surface.
+        behind: the distance behind the depth of a view up to which a vertex is visible, in world units.
     """
     import trimesh
 
@@ -192,7 +191,7 @@ def colour_vertices(mesh: Mesh, views: Sequence[Looked], behind: float) -> Mesh:
     total, weight = torch.zeros(3, len(mesh.vertices)), torch.zeros(len(mesh.vertices))
     for view in views:
         cameras = view.camera.at(None)
-        # By "zeros" the outer half pixel would fade to black.
+        # With "zeros" the outer half pixel would fade to black.
         colours, _ = functional.unproject_points(view.image[None, None], cameras, points, padding_mode="border")
         depth, visible = functional.unproject_points(
             view.depth[None, None, None], cameras, points, mode="nearest", augment=("depth", "direction")
@@ -200,7 +199,7 @@ def colour_vertices(mesh: Mesh, views: Sequence[Looked], behind: float) -> Mesh:
         known, z, *ray = depth[0, 0]
         cosine = -(torch.stack(ray, -1) * normals).sum(-1)
         seen = visible[0, 0] & (known > 0) & (z < known + behind)
-        # Never nothing, so that what is seen at a grazing angle alone has a colour too.
+        # Never 0, so that surfaces that are seen only at a grazing angle have a colour.
         each = torch.where(seen, cosine.clamp_min(0.03) ** 4, 0.0)
         total += each * colours[0, 0]
         weight += each

@@ -1,4 +1,4 @@
-"""``lsmgeo reconstruct`` with learnt models: from a scene's photographs to voxels or depth maps."""
+"""Reconstruction with learnt models: from the images of a scene to voxels or depth maps."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from lsmgeo.grids import VoxelGrid
 from lsmgeo.models.depth_lsm import DepthLSM
 from lsmgeo.models.voxel_lsm import VoxelLSM
 from lsmgeo.models.weights import load
-from lsmgeo.reconstruct.hull_method import colour_vertices, hull_depth, outline_iou
+from lsmgeo.reconstruct.hull_method import colour_vertices, hull_depth, silhouette_iou
 from lsmgeo.reconstruct.object_frame import (
     DISTANCE,
-    Framed,
-    Placement,
-    frame_view,
+    Crop,
+    ObjectFrame,
+    crop_view,
+    estimate_object_box,
+    frame_of_box,
     in_model_frame,
-    place_box,
-    place_object,
-    seen_from,
+    object_distances,
     spread_views,
 )
-from lsmgeo.reconstruct.sweep_method import mesh_facts, named_colour
-from lsmgeo.reconstruct.write_results import Looked, Results
+from lsmgeo.reconstruct.scene_input import named_colour
+from lsmgeo.reconstruct.write_results import Results, ViewResult, mesh_facts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,31 +50,31 @@ if TYPE_CHECKING:
 __all__ = ["METHODS", "Prediction", "learnt_results", "predict_scene"]
 
 METHODS: dict[str, type[VoxelLSM | DepthLSM]] = {"v-lsm": VoxelLSM, "d-lsm": DepthLSM}
-# Nearer than that, in sizes of the object, a camera stands in its cube; outside the range, models were not trained.
+# In sizes of the object: below the first distance a camera is in its cube; models were trained between the others.
 NEAREST, TRAINED = 0.9, (1.5, 2.7)
-# Views that silhouettes are read of to tell where the object is.
+# Views of which silhouettes are read to estimate the box of the object.
 MOST_MASKS = 24
-# How far the unit cube reaches from its middle, and so depth from the distance.
+# Half the diagonal of the unit cube: the largest difference between depth and the distance of its centre.
 REACH = 3**0.5 / 2
-# The surface is sampled more finely than the voxels that a model gives, so that it has colours as fine.
+# The surface is sampled more finely than the voxels of a model, so that its colours are finer.
 FINER, FINEST = 4, 128
-# Depth maps of a model agree with each other to about that; what fusing takes for noise, in sizes of the object.
+# The relative difference within which depth maps agree, and the truncation of fusing in sizes of the object.
 AGREEMENT, TRUNCATION = 0.02, 0.05
 SPECK_FACES = 20
-# On the validation split: a network below this IoU, or above this depth error, has barely begun to learn.
+# On the validation split: a network below this IoU, or above this depth error, is barely trained.
 LEAST_IOU, LARGEST_ERROR = 0.3, 0.1
-# Rays along which the largest probability is looked for, and how often.
+# The size of the map of largest probabilities in pixels, and the samples along each ray.
 LARGEST_SAMPLED, PLANES = 192, 96
 
 
 class Prediction(NamedTuple):
-    """What a model says of a scene."""
+    """The output of a model for a scene."""
 
-    result: Any  # of the model's run, in its own frame
-    placement: Placement
+    result: Any  # of the run of the model, in its own frame
+    frame: ObjectFrame
     views: tuple[int, ...]
-    framed: tuple[Framed, ...]  # the photographs as it took them
-    silhouettes: tuple[Tensor | None, ...]  # (H, W) bool, of the whole photographs
+    crops: tuple[Crop, ...]  # the images as the input of the model
+    silhouettes: tuple[Tensor | None, ...]  # (H, W) bool, of the whole images
     notes: tuple[str, ...]
 
 
@@ -88,45 +88,44 @@ def predict_scene(
     masks: str | os.PathLike[str] | None = None,
     background: str | Sequence[float] | None = None,
 ) -> Prediction:
-    """Run a model on a scene: find the object, cut the photographs as in training, and let the model see them.
+    """Run a model on a scene: estimate where the object is, crop the images as in training, and apply the model.
 
     Args:
-        scene: posed photographs.
+        scene: posed images.
         model: from `lsmgeo.models.create` or `load`.
-        first: the photograph that is read first; by default the scene's first that shows the object.
-        views: how many photographs are used at most, from all around.
-        box: where the object is, x, y, z and side of a cube in world units; told by default, see
-            `lsmgeo.reconstruct.object_frame.place_object`.
+        first: the image that is used first; by default the first of the scene that shows the object.
+        views: the largest number of images to use, from all around.
+        box: a cube around the object, x, y, z and side in world units; estimated by default, see
+            `lsmgeo.reconstruct.object_frame.estimate_object_box`.
         masks: folder of silhouettes, see `lsmgeo.classical.silhouettes`.
-        background: the colour behind the object, see there.
+        background: the colour of the background, see there.
 
     Raises:
-        OptionError: an option out of range, or no place for the object is told.
-        DataError: a photograph or a mask cannot be read.
+        OptionError: an option out of range, or the position of the object cannot be inferred.
+        DataError: an image or a mask cannot be read.
     """
     who = "reconstruct"
     check_whole(who, "views", views, 1, 1000)
     step = max(1, -(-len(scene) // MOST_MASKS))
     sought = list(dict.fromkeys([*([] if first is None else [first]), *range(0, len(scene), step)]))
     known = _silhouettes(scene, sought, masks, background)
-    placement = place_object(scene, known, sought) if box is None else place_box(scene, box)
-    away, is_seen = seen_from(scene, placement)
+    frame = estimate_object_box(scene, known, sought) if box is None else frame_of_box(scene, box)
+    away, is_seen = object_distances(scene, frame)
     usable = [number for number in range(len(scene)) if is_seen[number] and away[number] > NEAREST]
     if not usable:
         raise OptionError(
-            f"{who}: no photograph shows the middle of the object, as told by {placement.told_by}, from outside; give "
-            "box, x,y,z,side of a cube around it"
+            f"{who}: no image shows the centre of the object, as inferred from {frame.inferred_from}, from outside; "
+            "give box, x,y,z,side of a cube around it"
         )
-    chosen = spread_views(scene, placement, sorted(usable, key=lambda number: number != first), views)
-    outlines: Sequence[Tensor | None] = _silhouettes(scene, chosen, masks, background) or [None] * len(chosen)
-    framed = [
-        frame_view(scene, number, placement, model.image_size, outline)
-        for number, outline in zip(chosen, outlines, strict=True)
+    chosen = spread_views(scene, frame, sorted(usable, key=lambda number: number != first), views)
+    of_views: Sequence[Tensor | None] = _silhouettes(scene, chosen, masks, background) or [None] * len(chosen)
+    crops = [
+        crop_view(scene, number, frame, model.image_size, mask) for number, mask in zip(chosen, of_views, strict=True)
     ]
-    cameras = in_model_frame(stack([one.camera for one in framed]), placement)
-    result = model.run(torch.stack([one.image for one in framed])[None], cameras.at(None), by_view=False)
+    cameras = in_model_frame(stack([one.camera for one in crops]), frame)
+    result = model.run(torch.stack([one.image for one in crops])[None], cameras.at(None), by_view=False)
     notes = _notes(scene, first, usable, float(np.median(away[chosen])), has_masks=known is not None)
-    return Prediction(result, placement, tuple(chosen), tuple(framed), tuple(outlines), notes)
+    return Prediction(result, frame, tuple(chosen), tuple(crops), tuple(of_views), notes)
 
 
 def learnt_results(
@@ -144,26 +143,27 @@ def learnt_results(
     resolution: int = 192,
     size: int = 640,
 ) -> Results:
-    """What a learnt model makes of a scene.
+    """Reconstruct a scene with a learnt model.
 
     Args:
-        scene: posed photographs.
-        view: the one that is looked from first, and read first.
-        title: of what is written.
+        scene: posed images.
+        view: the view to start from, in the page and as the first input; None for the first usable one.
+        title: of the page and the figures.
         method: "v-lsm", voxels and their surface; or "d-lsm", depth maps, points and the surface that they fuse to.
         weights: a file of `lsmgeo.models.write_weights`, a checkpoint or a run folder.
         views: see `predict_scene`, like box, masks and background.
-        box: four numbers with commas between.
+        box: four numbers, separated by commas.
         threshold: probability from which a voxel is solid, for "v-lsm".
         masks: see `predict_scene`.
-        background: "black", "white", or three numbers from 0 to 1 with commas between.
-        resolution: voxels along a side of the cube in which the surface is made, at most.
-        size: longer side in pixels of the pictures that voxels are shown in.
+        background: "black", "white", or three numbers from 0 to 1, separated by commas.
+        resolution: the largest number of voxels along a side of the cube in which the surface is made.
+        size: longer side in pixels of the images in which voxels are shown.
 
     Raises:
-        OptionError: no weights or those of another model, an option out of range, no place for the object is told.
+        OptionError: no weights, or weights of another model; an option out of range; the position of the object cannot
+            be inferred.
         CheckpointError: the weights cannot be read.
-        DataError: a photograph or a mask cannot be read.
+        DataError: an image or a mask cannot be read.
     """
     who = "reconstruct"
     check_choice(who, "method", method, tuple(METHODS))
@@ -176,15 +176,13 @@ def learnt_results(
     found = predict_scene(
         scene, model, first=view, views=views, box=cube, masks=masks, background=named_colour(background)
     )
-    x, y, z = found.placement.center
+    frame = found.frame
+    x, y, z = frame.center
     facts = (
-        ("scene", f"{len(scene)} photographs, {scene.source}"),
+        ("scene", f"{len(scene)} images, {scene.source}"),
         ("model", f"{model.name}, {sum(one.numel() for one in model.parameters())} parameters"),
         ("views", f"{len(found.views)}: {', '.join(map(str, found.views))}"),
-        (
-            "object",
-            f"a cube of {found.placement.side:.4g} about {x:.4g}, {y:.4g}, {z:.4g}, told by {found.placement.told_by}",
-        ),
+        ("object", f"a cube of {frame.side:.4g} about {x:.4g}, {y:.4g}, {z:.4g}, inferred from {frame.inferred_from}"),
     )
     notes = (*_barely_trained(model.about), *found.notes)
     results = Results(title, facts, notes)
@@ -202,27 +200,27 @@ def _with_voxels(
     resolution: int,
     size: int,
 ) -> Results:
-    """Results with the surface of a model's voxels, and how it looks in the photographs."""
+    """Results with the surface of the voxels, and its depth in the images."""
     probability = found.result.occupancy[0].float().cpu()
-    place = found.placement.scene_from_model()
+    place = found.frame.scene_from_model()
     side = max(grid.shape[0], min(FINER * grid.shape[0], resolution))  # type: ignore[index]
     fine = interpolate(probability[None, None], (side,) * 3, mode="trilinear")[0, 0]
     coarse_grid, fine_grid = (VoxelGrid(n, grid.lower, grid.upper, place) for n in (probability.shape[0], side))
-    seen, looked = [], []
-    for view, outline in zip(found.views, found.silhouettes, strict=True):
+    seen, views = [], []
+    for view, whole_mask in zip(found.views, found.silhouettes, strict=True):
         shape = fitted(scene.size(view), size)
         camera, image = resize(scene.camera(view), *shape), resized(scene.load(view), shape)
         depth = hull_depth(fine > threshold, fine_grid, camera)
-        numbers = [("model", f"{100 * float((depth > 0).float().mean()):.1f} % of the picture")]
+        numbers = [("model", f"{100 * float((depth > 0).float().mean()):.1f} % of the image")]
         coloured = depth
-        if outline is not None:
-            mask = resized(outline[None].float(), shape)[0] > 0.5
-            numbers.append(("IoU of silhouette and model", f"{outline_iou(depth, mask):.3f}"))
-            # Where the model is too large, a photograph shows what is behind the object.
+        if whole_mask is not None:
+            mask = resized(whole_mask[None].float(), shape)[0] > 0.5
+            numbers.append(("IoU of silhouette and model", f"{silhouette_iou(depth, mask):.3f}"))
+            # Where the model is too large, an image shows the background.
             coloured = torch.where(mask, depth, 0.0)
-        certain = _largest(probability, coarse_grid, camera, found.placement)
-        looked.append(Looked(view, image, camera, depth, certain, "probability", tuple(numbers)))
-        seen.append(looked[-1]._replace(depth=coloured))
+        confidence = _largest(probability, coarse_grid, camera, found.frame)
+        views.append(ViewResult(view, image, camera, depth, confidence, "probability", tuple(numbers)))
+        seen.append(views[-1]._replace(depth=coloured))
     mesh = drop_specks(extract_mesh(fine, fine_grid, level=threshold), SPECK_FACES)
     solid = 100 * float((probability > threshold).float().mean())
     facts = [("voxels", f"{' x '.join(map(str, probability.shape))}, {solid:.1f} % above {threshold:g}")]
@@ -230,29 +228,27 @@ def _with_voxels(
     if len(mesh.faces):
         mesh = colour_vertices(mesh, seen, 2 * voxel_side(coarse_grid))
     else:
-        notes = (
-            f"No voxel is more likely solid than {threshold:g}; the largest probability is {probability.max():.2g}.",
-        )
+        notes = (f"No voxel has a probability above {threshold:g}; the largest is {probability.max():.2g}.",)
     return results._replace(
-        facts=(*results.facts, *facts, *mesh_facts(mesh)), notes=results.notes + notes, views=tuple(looked), mesh=mesh
+        facts=(*results.facts, *facts, *mesh_facts(mesh)), notes=results.notes + notes, views=tuple(views), mesh=mesh
     )
 
 
 def _with_depth(results: Results, found: Prediction, grid: VoxelGrid, resolution: int) -> Results:
-    """Results with a model's depth maps, their points and the surface that they fuse to."""
-    placement = found.placement
+    """Results with the depth maps, their points and the surface that they fuse to."""
+    frame = found.frame
     maps = found.result.depth[0].float().cpu()
     shape = (maps.shape[1], maps.shape[2])
-    cameras = [resize(one.camera, *shape) for one in found.framed]
-    images = [resized(one.image, shape) for one in found.framed]
+    cameras = [resize(one.camera, *shape) for one in found.crops]
+    images = [resized(one.image, shape) for one in found.crops]
     known = []
-    for one, depth, camera in zip(found.framed, maps, cameras, strict=True):
-        middle = float(in_model_frame(camera, placement).cam_from_world[2, 3])
+    for one, depth, camera in zip(found.crops, maps, cameras, strict=True):
+        middle = float(in_model_frame(camera, frame).cam_from_world[2, 3])
         on = one.inside if one.mask is None else one.mask
         on = resized(on[None].float(), shape)[0] > 0.5
         on = on & ((depth - middle).abs() < REACH) & (depth > 0)
-        known.append(torch.where(on, depth * placement.side, 0.0))
-    looked, points, colours = [], [], []
+        known.append(torch.where(on, depth * frame.side, 0.0))
+    views, points, colours = [], [], []
     for number, (view, depth, camera, image) in enumerate(zip(found.views, known, cameras, images, strict=True)):
         others = [other for other in range(len(known)) if other != number]
         support = consistent_views(
@@ -263,7 +259,7 @@ def _with_depth(results: Results, found: Prediction, grid: VoxelGrid, resolution
             pixels=2.0,
             relative=AGREEMENT,
         )
-        # Of two views alone, what either sees would be lost by asking the other.
+        # With only two views, a check would drop what only one of them shows.
         kept = (depth > 0) & ((support > 0) | (len(others) < 2))
         share = support / max(1, len(others)) if others else (depth > 0).float()
         numbers = [("kept", f"{100 * float(kept.float().mean()):.1f} %")]
@@ -271,49 +267,49 @@ def _with_depth(results: Results, found: Prediction, grid: VoxelGrid, resolution
             numbers.append(("median depth", f"{float(depth[kept].median()):.4g}"))
         if others and bool((depth > 0).any()):
             numbers.append(("other views that agree", f"{float(support[depth > 0].float().mean()):.1f} on average"))
-        looked.append(Looked(view, image, camera, depth, share.float(), "share of views that agree", tuple(numbers)))
+        views.append(ViewResult(view, image, camera, depth, share.float(), "share of views that agree", tuple(numbers)))
         points.append(unproject_depth(camera.at(None), depth[None, None].double())[0, 0][kept].float().numpy())
         colours.append(as_pixels(image)[kept])
     side = min(resolution, FINEST)
-    fine = VoxelGrid(side, grid.lower, grid.upper, placement.scene_from_model())
+    fine = VoxelGrid(side, grid.lower, grid.upper, frame.scene_from_model())
     fused = fuse_depth(
         known,
         stack(cameras),
         fine,
         colours=images,
-        truncation=max(TRUNCATION * placement.side, 3 * voxel_side(fine)),
+        truncation=max(TRUNCATION * frame.side, 3 * voxel_side(fine)),
         background=_empty(found, shape),
     )
     mesh = extract_mesh(fused, fine, specks=SPECK_FACES)
     count = sum(map(len, points))
     facts = [("kept", f"{count} pixels, {100 * count / maps.numel():.1f} %"), *mesh_facts(mesh)]
-    notes = () if count else ("No depth lies in the cube of the object.",)
+    notes = () if count else ("No depth is in the cube of the object.",)
     return results._replace(
         facts=results.facts + tuple(facts),
         notes=results.notes + notes,
-        views=tuple(looked),
+        views=tuple(views),
         points=np.concatenate(points),
         colours=np.concatenate(colours),
         mesh=mesh if len(mesh.faces) else None,
     )
 
 
-def _largest(probability: Tensor, grid: VoxelGrid, camera: CameraTensors, placement: Placement) -> Tensor:
-    """(h, w) the largest probability along each ray, at the camera's size; sampled at a size that voxels need."""
+def _largest(probability: Tensor, grid: VoxelGrid, camera: CameraTensors, frame: ObjectFrame) -> Tensor:
+    """The largest probability along each ray (h, w), at the size of the camera."""
     whole = int(torch.as_tensor(camera.height)), int(torch.as_tensor(camera.width))
     shape = fitted(whole, LARGEST_SAMPLED)
-    middle = float(in_model_frame(camera, placement).cam_from_world[2, 3])
-    planes = torch.linspace(max(middle - REACH, 1e-3), middle + REACH, PLANES, dtype=torch.float64) * placement.side
+    middle = float(in_model_frame(camera, frame).cam_from_world[2, 3])
+    planes = torch.linspace(max(middle - REACH, 1e-3), middle + REACH, PLANES, dtype=torch.float64) * frame.side
     maps, _ = plane_sweep_project(probability[None, None], camera.at(None), grid, planes, shape)
     largest = rays.max_along_rays(maps[0, 0])
     return resized(largest[None].clamp(0, 1), whole)[0]
 
 
 def _empty(found: Prediction, shape: tuple[int, int]) -> list[Tensor] | None:
-    """Where silhouettes say that there is nothing, (h, w) bool of every view; None without silhouettes."""
-    if any(one.mask is None for one in found.framed):
+    """The background by the silhouettes, (h, w) bool of every view; None without silhouettes."""
+    if any(one.mask is None for one in found.crops):
         return None
-    off = (one.inside & ~one.mask for one in found.framed if one.mask is not None)
+    off = (one.inside & ~one.mask for one in found.crops if one.mask is not None)
     return [resized(one[None].float(), shape)[0] > 0.5 for one in off]
 
 
@@ -325,7 +321,7 @@ def _load(method: str, weights: str | os.PathLike[str] | None) -> VoxelLSM | Dep
         return model
     name = getattr(model, "name", type(model).__name__)
     suited = next((other for other, kind in METHODS.items() if kind.name == name), None)
-    other = f"use method {suited}" if suited else "no method of reconstruct takes these, lsmgeo evaluate measures them"
+    other = f"use method {suited}" if suited else "no method of reconstruct uses these; lsmgeo evaluate measures them"
     raise OptionError(
         f"reconstruct: method {method} needs weights of a {METHODS[method].name}; {os.fspath(weights)} holds those of "
         f"a {name}: {other}"
@@ -333,7 +329,7 @@ def _load(method: str, weights: str | os.PathLike[str] | None) -> VoxelLSM | Dep
 
 
 def _barely_trained(about: Mapping[str, Any]) -> tuple[str, ...]:
-    """A note where training left a network that is still bad on its validation split, as its file says."""
+    """A note if the network is still bad on its validation split, according to its file."""
     validation: Any = about.get("validation")
     try:
         is_iou, value, step = validation["measure"] == "iou", float(validation["by_view"][-1]), int(validation["step"])
@@ -361,7 +357,7 @@ def _silhouettes(
     masks: str | os.PathLike[str] | None,
     background: str | Sequence[float] | None,
 ) -> list[Tensor] | None:
-    """Those that are named or that lie beside the photographs; None where there are none."""
+    """The silhouettes that are given, or that the scene has; None without any."""
     if masks is None and background is None and not scene.cut_out and mask_folder(scene) is None:
         return None
     return silhouettes(scene, views, folder=masks, background=background)
@@ -373,15 +369,15 @@ def _notes(
     notes = []
     if not has_masks:
         notes.append(
-            "No silhouettes: the models were trained on objects before white, and what is behind this one will disturb "
-            "them. Give masks, a folder of silhouettes, or background, the colour behind the object."
+            "No silhouettes: the models were trained on objects on a white background, and another background disturbs "
+            "them. Give masks, a folder of silhouettes, or background, its colour."
         )
     if first is not None and first not in usable:
-        notes.append(f"{scene.names[first]} does not show the middle of the object, and is not used.")
+        notes.append(f"{scene.names[first]} does not show the centre of the object, and is not used.")
     low, high = TRAINED
     if not low < away < high:
         notes.append(
-            f"The cameras are {away:.1f} sizes of the object away from it; models are trained from {DISTANCE:g}. Where "
-            "the object was told wrongly, give box."
+            f"The cameras are {away:.1f} sizes of the object away from it; models are trained with {DISTANCE:g}. If "
+            "its inferred position is wrong, give box."
         )
     return tuple(notes)

@@ -1,4 +1,4 @@
-"""One HTML page of a reconstruction that loads nothing: facts, the model to turn, and every view's pictures."""
+"""The self-contained HTML page of a reconstruction: facts, an interactive model, and the images of every view."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from lsmgeo.cameras import CameraTensors
-    from lsmgeo.reconstruct.write_results import Looked, Results
+    from lsmgeo.reconstruct.write_results import Results, ViewResult
 
 __all__ = ["make_page"]
 
-# Pictures are no larger than that, in pixels of the longer side and in bytes; together no more than that.
+# The largest images, in pixels of the longer side and in bytes; the most bytes of all images.
 LONGEST_SIDE, SHORTEST_SIDE = 480, 160
 MOST_BYTES, MOST_BYTES_OF_ALL = 150_000, 12_000_000
-PICTURES, STOPS = 3, 12
+IMAGES, STOPS = 3, 12
 
 
 def make_page(results: Results, names: Sequence[str], cameras: CameraTensors) -> str:
-    """Make the page; all text is escaped, and the page forbids itself to load anything.
+    """Make the page. All text is escaped, and the security policy of the page forbids it to load anything.
 
     Args:
-        results: shown from its facts to its views, one below the other; their pictures are reduced to 480 pixels and
-            150 kB at most, and to less where many views would make more than about 12 MB.
-        names: of all photographs.
-        cameras: leading shape (V,), of all photographs, drawn about the model.
+        results: their facts and views are shown; images are reduced to at most 480 pixels and 150 kB, and further if
+            those of all views would exceed about 12 MB.
+        names: of all images.
+        cameras: leading shape (V,), of all images, drawn around the model.
 
     Returns:
-        HTML, without a model where there are neither points nor faces.
+        HTML, without a model if there are neither points nor faces.
     """
     from jinja2 import Environment
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
-    most = min(MOST_BYTES, MOST_BYTES_OF_ALL // max(1, PICTURES * len(results.views)))
+    most = min(MOST_BYTES, MOST_BYTES_OF_ALL // max(1, IMAGES * len(results.views)))
     template = files("lsmgeo.reconstruct").joinpath("page.html").read_text("utf-8")
     has_model = len(results.points) or (results.mesh is not None and len(results.mesh.faces))
     return (
@@ -53,28 +53,28 @@ def make_page(results: Results, names: Sequence[str], cameras: CameraTensors) ->
             title=results.title,
             facts=results.facts,
             notes=results.notes,
-            hint="Depth is red where it is near and blue where it is far; grey where none was kept. Here pictures are "
-            f"reduced to at most {LONGEST_SIDE} pixels and {most / 1000:.0f} kB.",
+            hint="Depth is red where it is near and blue where it is far; grey where none was kept. Images are reduced "
+            f"to at most {LONGEST_SIDE} pixels and {most / 1000:.0f} kB.",
             gradient=", ".join(to_hex(colormaps["turbo_r"](stop)) for stop in np.linspace(0, 1, STOPS)),
             viewer=make_viewer(results, cameras) if has_model else None,
             views=[
-                {"number": one.view, "name": names[one.view], "numbers": one.numbers, "pictures": _pictures(one, most)}
+                {"number": one.view, "name": names[one.view], "numbers": one.numbers, "images": _images(one, most)}
                 for one in results.views
             ],
         )
     )
 
 
-def _pictures(one: Looked, most: int) -> list[dict[str, Any]]:
-    """What the template needs of a view's photograph, depth and certainty."""
+def _images(one: ViewResult, most: int) -> list[dict[str, Any]]:
+    """The image, the depth and the confidence of a view, for the template."""
     from PIL import Image
 
     low, high = depth_limits(one.depth)
     depth = np.where(one.depth > 0, (one.depth - low) / max(high - low, 1e-12), np.nan)
     drawn = [
-        ("photograph", "photograph", None, Image.fromarray(as_pixels(one.image))),
+        ("image", "image", None, Image.fromarray(as_pixels(one.image))),
         ("depth [world units]", "depth", (f"{low:.4g}", f"{high:.4g}"), _of_palette(depth, "turbo_r")),
-        (one.meaning, "confidence", ("0", "1"), _of_palette(one.certain.numpy(), "gray")),
+        (one.confidence_name, "confidence", ("0", "1"), _of_palette(one.confidence.numpy(), "gray")),
     ]
     size = tuple(one.depth.shape)
     return [
@@ -84,10 +84,10 @@ def _pictures(one: Looked, most: int) -> list[dict[str, Any]]:
 
 
 def _encoded(image: Any, most: int) -> str:
-    """A data URI of a picture that is reduced until it has no more bytes than that."""
+    """The data URI of an image that is reduced until it has at most so many bytes."""
     from PIL import Image
 
-    # Between two depths lies none.
+    # A mean of two depths is not a depth of the scene.
     kind, how = ("JPEG", Image.Resampling.BOX) if image.mode == "RGB" else ("PNG", Image.Resampling.NEAREST)
     side = LONGEST_SIDE
     while True:

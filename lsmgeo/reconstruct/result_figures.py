@@ -1,4 +1,4 @@
-"""Pictures of a reconstruction, for people."""
+"""Figures of a reconstruction: coloured depth, and the summary."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from lsmgeo.cameras import CameraTensors
-    from lsmgeo.reconstruct.write_results import Looked
+    from lsmgeo.reconstruct.write_results import ViewResult
 
 __all__ = ["coloured_depth", "depth_limits", "summary"]
 
-# Of the summary, in inches: its width, and what there is of its height beside the pictures.
+# The summary in inches: its width, and its height besides the images.
 WIDTH, BESIDE = 11.0, 2.3
-# Degrees by which the points are seen from aside.
+# The angle from which the points are drawn, in degrees from the camera.
 ASIDE = 25.0
 MOST_DRAWN = 150_000
 
 
 def coloured_depth(depth: torch.Tensor) -> np.ndarray:
-    """Depth as colours, near is red, far is blue, transparent where there is none: (h, w, 4) uint8."""
+    """Depth in colours, red is near, blue is far, transparent where it is unknown: (h, w, 4) uint8."""
     from matplotlib import colormaps
 
     low, high = depth_limits(depth)
@@ -35,7 +35,7 @@ def coloured_depth(depth: torch.Tensor) -> np.ndarray:
 
 
 def depth_limits(depth: torch.Tensor) -> tuple[float, float]:
-    """The depths that are drawn in the deepest red and blue: of 98 % of the pixels that have any."""
+    """The ends of the colour scale: the 1st and 99th percentile of depth."""
     values = depth[depth > 0].numpy()
     if len(values) == 0:
         return 0.0, 1.0
@@ -43,32 +43,32 @@ def depth_limits(depth: torch.Tensor) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def summary(one: Looked, points: np.ndarray, colours: np.ndarray, title: str) -> bytes:
-    """One PNG with a view's photograph, its depth, what is certain of it, and the points seen from aside.
+def summary(one: ViewResult, points: np.ndarray, colours: np.ndarray, title: str) -> bytes:
+    """A PNG with the image of a view, its depth, its confidence, and the points from the side.
 
     Args:
         one: the view.
         points: (N, 3) of the model.
         colours: (N, 3) uint8.
-        title: to write above.
+        title: the title.
     """
     shape = min(1.2, one.depth.shape[0] / one.depth.shape[1])
     figure = new_figure(WIDTH, WIDTH * shape + BESIDE)
     figure.suptitle(title, wrap=True)
     panels = figure.subplots(2, 2)
-    (photograph, depth), (certain, cloud) = panels
-    photograph.imshow(as_pixels(one.image))
+    (image, depth), (confidence, cloud) = panels
+    image.imshow(as_pixels(one.image))
     low, high = depth_limits(one.depth)
     depth.set_facecolor("0.9")
     shown = depth.imshow(np.where(one.depth > 0, one.depth, np.nan), cmap="turbo_r", vmin=low, vmax=high)
     figure.colorbar(shown, ax=depth, location="bottom", aspect=60, label="camera z [world units]")
-    shown = certain.imshow(one.certain.numpy(), cmap="gray", vmin=0, vmax=1)
-    words = "0 nothing known, 1 certain" if one.meaning == "confidence" else "1 on the object"
-    figure.colorbar(shown, ax=certain, location="bottom", aspect=60, label=words)
+    shown = confidence.imshow(one.confidence.numpy(), cmap="gray", vmin=0, vmax=1)
+    words = "0 nothing known, 1 certain" if one.confidence_name == "confidence" else "1 on the object"
+    figure.colorbar(shown, ax=confidence, location="bottom", aspect=60, label=words)
     _draw_cloud(cloud, one.camera, points, colours, 1 / shape)
     known = 100 * float((one.depth > 0).float().mean())
     aside = f"the model, seen from {ASIDE:.0f} degrees to the side"
-    names = ("photograph", f"depth of {known:.0f} % of the pixels", one.meaning, aside)
+    names = ("image", f"depth of {known:.0f} % of the pixels", one.confidence_name, aside)
     for axes, name in zip(panels.flat, names, strict=True):
         axes.set_title(name, fontsize=10)
         axes.set_anchor("N")
@@ -78,7 +78,7 @@ def summary(one: Looked, points: np.ndarray, colours: np.ndarray, title: str) ->
 
 
 def _draw_cloud(axes: Axes, camera: CameraTensors, points: np.ndarray, colours: np.ndarray, shape: float) -> None:
-    """The points as a camera sees them that went round their middle by some degrees, far ones first."""
+    """The points from a camera that is rotated about their centre by `ASIDE` degrees, far ones first."""
     if len(points) == 0:
         return
     from scipy.spatial.transform import Rotation
@@ -90,7 +90,7 @@ def _draw_cloud(axes: Axes, camera: CameraTensors, points: np.ndarray, colours: 
     order = np.argsort(-z)
     axes.scatter(x[order], y[order], c=colours[chosen][order] / 255.0, s=3.0, marker="s", linewidths=0)
     (left, right), (top, bottom) = (np.percentile(values, (1, 99)) for values in (x, y))
-    # As wide and as high as shows all, in the shape of the photograph.
+    # Limits that show all points, in the shape of the image.
     half = 0.55 * max(bottom - top, (right - left) / shape) + 1e-9
     axes.set_xlim((left + right) / 2 - shape * half, (left + right) / 2 + shape * half)
     axes.set_ylim((top + bottom) / 2 + half, (top + bottom) / 2 - half)  # y points down

@@ -1,9 +1,9 @@
-"""The methods of ``lsmgeo reconstruct``: what is done for whole scenes, and what is told of it."""
+"""Reconstruction by plane-sweep stereo, of one view or of all."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -12,17 +12,17 @@ from lsmgeo._checks import check_whole
 from lsmgeo.classical.stereo import Reconstruction, reconstruct_views, surface_of
 from lsmgeo.classical.sweep_options import SweepOptions
 from lsmgeo.classical.views import default_depth_range, select_neighbours
-from lsmgeo.errors import DataError, OptionError
-from lsmgeo.reconstruct.write_results import Looked, Results
+from lsmgeo.errors import OptionError
+from lsmgeo.reconstruct.scene_input import first_few
+from lsmgeo.reconstruct.write_results import Results, ViewResult, mesh_facts
 
 if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
     from lsmgeo.data.meshes import Mesh
 
-__all__ = ["mesh_facts", "named_colour", "readable", "sweep_results"]
+__all__ = ["sweep_results"]
 
-MOST_NAMED = 5
-# Kept pixels below this fraction are worth a word.
+# Below this fraction of kept pixels the results have a note.
 FEW = 0.05
 # Along the longest side of the box of the mesh.
 MOST_VOXELS = 1024
@@ -30,91 +30,55 @@ MOST_VOXELS = 1024
 VIEW_DENSITY = 0.4
 
 
-def readable(scene: PosedImages) -> tuple[PosedImages, tuple[str, ...]]:
-    """A scene without the photographs that cannot be read, and a note on those.
-
-    Returns:
-        The scene itself where all can be read.
-
-    Raises:
-        DataError: none can be read.
-    """
-    kept: list[int] = []
-    reasons: list[str] = []
-    for view in range(len(scene)):
-        try:
-            scene.load(view)
-        except DataError as error:
-            if len(scene) == len(reasons) + 1:
-                raise
-            reasons.append(str(error))
-        else:
-            kept.append(view)
-    if not reasons:
-        return scene, ()
-    points = scene.points
-    if points is not None:
-        points = points._replace(observations=tuple(points.observations[view] for view in kept))
-    fewer = replace(
-        scene,
-        names=tuple(scene.names[view] for view in kept),
-        paths=tuple(scene.paths[view] for view in kept),
-        cameras=scene.cameras.at(kept),
-        points=points,
-        lenses=None if scene.lenses is None else tuple(scene.lenses[view] for view in kept),
-        depths=None if scene.depths is None else tuple(scene.depths[view] for view in kept),
-    )
-    return fewer, (f"Left out, as it cannot be read: {_some(reasons)}",)
-
-
 def sweep_results(
     scene: PosedImages,
     view: int | None,
     title: str,
-    options: SweepOptions,
     *,
     check: int,
     resolution: int,
+    **options: Any,
 ) -> Results:
     """Plane-sweep stereo of one view, or of all that can be swept.
 
     Args:
-        scene: posed photographs.
-        view: the one to sweep; None for all.
+        scene: posed images.
+        view: the view to sweep; None for all.
         title: of the page and the figures.
-        options: of the sweeps.
         check: the number of neighbours of one view that are swept too; all of them must agree with it.
         resolution: voxels along the longest side of the box of the mesh.
+        options: the fields of `SweepOptions`.
 
     Raises:
         OptionError: an option out of range, or no view can be swept.
-        DataError: a photograph cannot be read.
+        DataError: an image cannot be read.
     """
+    sweep = SweepOptions(**options, who="reconstruct")
     check_whole("reconstruct", "resolution", resolution, 8, MOST_VOXELS)
     notes: tuple[str, ...] = ()
     mesh: Mesh | None = None
     views: tuple[Reconstruction, ...]
     if view is not None:
-        one = _checked_view(scene, view, check, options)
+        one = _checked_view(scene, view, check, sweep)
         views, points, colours = (one,), one.points, one.colours
         mesh = surface_of(views, points, resolution) if len(points) else None
     else:
-        able, notes = _able(scene, options)
-        found = reconstruct_views(scene, able, options, resolution=resolution, progress=True)
+        able, notes = _able(scene, sweep)
+        found = reconstruct_views(scene, able, sweep, resolution=resolution, progress=True)
         views, points, colours, mesh = found.views, found.points, found.colours, found.mesh
     if not len(points):
         notes += (
-            "No pixel was kept: nowhere do the photographs match with any certainty. They may lack texture, be too "
-            "far apart, or have wrong cameras (lsmgeo info tells), or the true depth lies outside near and far.",
+            "No pixel was kept: the images match nowhere with enough confidence. They may lack texture, be too far "
+            "apart, or have wrong cameras (see lsmgeo info), or the true depth is not between near and far.",
         )
     pixels, whole = sum(int(one.mask.sum()) for one in views), sum(one.mask.numel() for one in views)
     if 0 < pixels < FEW * whole:
-        other = ". They are cut out: --method hull is the other way" if scene.cut_out else ""
+        other = ". They are cut out, which suits --method hull" if scene.cut_out else ""
         notes += (
-            f"Only {100 * pixels / whole:.1f} % of the pixels were kept: the photographs may be few, far apart or "
-            f"without texture, or their cameras wrong (lsmgeo info tells){other}.",
+            f"Only {100 * pixels / whole:.1f} % of the pixels were kept: the images may be few, far apart or without "
+            f"texture, or their cameras wrong (see lsmgeo info){other}.",
         )
-    facts = [("scene", f"{len(scene)} photographs, {scene.source}")]
+    facts = [("scene", f"{len(scene)} images, {scene.source}")]
     first = views[0]
     if view is not None:
         matched = ", ".join(scene.names[other] for other in first.neighbours)
@@ -124,42 +88,25 @@ def sweep_results(
         facts.append(("views", f"{len(views)} of {len(scene)} swept{together}"))
     height, width = first.mask.shape
     low, high = (float(np.median([one.depths[end] for one in views])) for end in (0, -1))
-    typical = " (the middle of the views' own ranges)" if len(views) > 1 else ""
+    typical = " (the median over views)" if len(views) > 1 else ""
     planes = f"{len(first.depths)} planes from {low:.4g} to {high:.4g}{typical}"
     facts.append(("sweep", f"{width} x {height} pixels, {planes}"))
-    facts.append(("memory", f"at most {options.memory >> 20} MiB a sweep beyond the libraries and the photographs"))
+    facts.append(("memory", f"at most {sweep.memory >> 20} MiB per sweep, besides the libraries and the images"))
     facts.append(("kept", f"{pixels} pixels, {100 * pixels / whole:.1f} %"))
     errors = [one.error for one in views if one.error is not None and one.error.points]
     if errors:
         median = np.median([error.median for error in errors])
         count, observed = sum(error.points for error in errors), sum(error.observed for error in errors)
-        of_views = "" if len(views) == 1 else ", median of the views'"
+        of_views = "" if len(views) == 1 else ", median over views"
         words = f"median {100 * median:.3f} % of the depth at {count} of {observed} sparse points{of_views}"
         facts.append(("depth error", words))
     facts += mesh_facts(mesh)
     used = tuple({other for one in views for other in one.neighbours})
-    return Results(title, tuple(facts), notes, tuple(map(_looked, views)), points, colours, mesh, used)
-
-
-def named_colour(background: str | None) -> str | tuple[float, ...] | None:
-    """A colour as `lsmgeo.classical.silhouettes` takes it, of a name or of three numbers with commas between."""
-    if background is None or "," not in background:
-        return background
-    try:
-        return tuple(float(part) for part in background.split(","))
-    except ValueError:
-        raise OptionError(
-            f"background must be black, white or three numbers such as 0.1,0.8,0.2; got {background!r}"
-        ) from None
-
-
-def _some(reasons: list[str]) -> str:
-    more = f"; and {len(reasons) - MOST_NAMED} more" if len(reasons) > MOST_NAMED else ""
-    return "; ".join(reasons[:MOST_NAMED]) + more
+    return Results(title, tuple(facts), notes, tuple(map(_view_result, views)), points, colours, mesh, used)
 
 
 def _checked_view(scene: PosedImages, view: int, check: int, options: SweepOptions) -> Reconstruction:
-    """One view, with the pixels kept with which its best neighbours agree that can be swept themselves."""
+    """One view, of which the pixels are kept that agree with those of its best neighbours that can be swept."""
     if check < 0:
         raise OptionError(f"check must be 0 or more; got {check}")
     others = []
@@ -174,7 +121,7 @@ def _checked_view(scene: PosedImages, view: int, check: int, options: SweepOptio
 
 
 def _able(scene: PosedImages, options: SweepOptions, *, only: int | None = None) -> tuple[list[int], tuple[str, ...]]:
-    """The views that have a depth range and neighbours, and a note on the others; one may have to be among them."""
+    """The views that have a depth range and neighbours, and a note on the others; `only` must be one of them."""
     able, reasons = [], []
     for view in range(len(scene)):
         near, far = options.near, options.far
@@ -182,7 +129,7 @@ def _able(scene: PosedImages, options: SweepOptions, *, only: int | None = None)
             if near is None or far is None:
                 lower, upper = default_depth_range(scene, view)
                 near, far = lower if near is None else near, upper if far is None else far
-                # One end alone may suit most views and lie beyond what another sees.
+                # If only one end is given, it may suit most views but not the range of another.
                 if not near < far:
                     raise OptionError(f"near and far must be positive, finite and ascending; got {near} and {far}")
             select_neighbours(scene, view, options.neighbours, near=near, far=far)
@@ -194,18 +141,11 @@ def _able(scene: PosedImages, options: SweepOptions, *, only: int | None = None)
             able.append(view)
     if not able and reasons:
         raise reasons[0][1]
-    words = _some([f"{scene.names[view]}: {error}" for view, error in reasons])
+    words = first_few([f"{scene.names[view]}: {error}" for view, error in reasons])
     return able, (f"Not swept: {words}",) if reasons else ()
 
 
-def mesh_facts(mesh: Mesh | None) -> list[tuple[str, str]]:
-    """How large a mesh is; nothing of one without faces."""
-    if mesh is None or not len(mesh.faces):
-        return []
-    return [("mesh", f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces")]
-
-
-def _looked(one: Reconstruction) -> Looked:
+def _view_result(one: Reconstruction) -> ViewResult:
     depth = torch.where(one.mask, one.depth_map.depth, 0.0)
     numbers = [("kept", f"{100 * float(one.mask.float().mean()):.1f} %")]
     if bool(one.mask.any()):
@@ -218,4 +158,4 @@ def _looked(one: Reconstruction) -> Looked:
     if one.error is not None and one.error.points:
         numbers.append(("error at sparse points", f"{100 * one.error.median:.3f} % ({one.error.points} points)"))
     confidence = one.depth_map.confidence
-    return Looked(one.view, one.image, one.camera, depth, confidence, "confidence", tuple(numbers))
+    return ViewResult(one.view, one.image, one.camera, depth, confidence, "confidence", tuple(numbers))

@@ -1,4 +1,4 @@
-// Runs after the page of trimesh, whose variables camera, controls, scene, renderer and function render it uses.
+// Runs after the page of trimesh, and uses its variables camera, controls, scene, renderer and its function render.
 function lookFrom(place, forward, up, field) {
   const distance = Math.max(0.1, -(place[0] * forward[0] + place[1] * forward[1] + place[2] * forward[2]));
   camera.fov = field;
@@ -11,12 +11,12 @@ function lookFrom(place, forward, up, field) {
   render();
 }
 
-// All that the photograph shows is in the window, whatever its shape.
+// The field of view covers the whole image, whatever the shape of the window.
 function lookAsView(view) {
-  const stand = settings.stands[view];
-  const [high, wide] = stand.slice(9);
+  const pose = settings.poses[view];
+  const [high, wide] = pose.slice(9);
   const field = 2 * Math.atan(Math.max(high, wide / camera.aspect)) * 180 / Math.PI;
-  lookFrom(stand.slice(0, 3), stand.slice(3, 6), stand.slice(6, 9), Math.min(110, 1.05 * field));
+  lookFrom(pose.slice(0, 3), pose.slice(3, 6), pose.slice(6, 9), Math.min(110, 1.05 * field));
 }
 
 function lookAtStart() {
@@ -49,7 +49,7 @@ function addTools() {
   for (const name of ["mesh", "points", "cameras"]) {
     const part = scene.getObjectByName(name);
     if (part === undefined) continue;
-    // Points lie on the mesh, and would hide it.
+    // Points are on the mesh, and would hide it.
     addBox(name, name !== "points" || !hasMesh, (shown) => { part.visible = shown; render(); });
   }
   if (hasMesh) addBox("shading", settings.shaded, shade);

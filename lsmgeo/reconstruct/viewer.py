@@ -1,7 +1,6 @@
-"""A model, and the cameras that saw it, to be turned in a browser: one HTML document that loads nothing.
+"""The interactive model and its cameras as a self-contained HTML document.
 
-The drawing is three.js's, which trimesh carries in a page of its own; here the model is placed before it, and a few
-controls are added.
+three.js draws, from the page that comes with trimesh; this file adds the poses and a few controls.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ if TYPE_CHECKING:
 __all__ = ["make_viewer"]
 
 MOST_FACES, MOST_POINTS = 250_000, 200_000
-# Of the model, whose middle is the origin and whose radius is 1: how long a frustum may be, and of the way to its
-# nearest neighbour.
+# The largest length of a frustum, where the radius of the model is 1, and its length as a fraction of the distance to
+# the nearest camera.
 LONGEST_FRUSTUM, FRUSTUM_OF_GAP = 0.35, 0.6
 USED, UNUSED, REFERENCE = (31, 119, 180), (170, 170, 170), (214, 39, 40)
 PLAIN = (176, 180, 188)
@@ -35,16 +34,15 @@ EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]
 
 
 def make_viewer(results: Results, cameras: CameraTensors) -> str:
-    """An HTML document that shows a model as its first view's camera sees it, and lets it be turned.
+    """An HTML document with an interactive model, at first from the camera of the first view.
 
     Convention:
-        In the document the first camera's y points up, the middle of the model is the origin, and nine tenths of it
-        lie within a radius of 1.
+        In the document the y axis of the first camera points up, the centre of the model is the origin, and about 97 %
+        of it are within a radius of 1.
 
     Args:
-        results: with a surface, or points, or both. Larger ones than a browser likes are thinned: surfaces to 250,000
-            faces, points to 200,000.
-        cameras: leading shape (V,), drawn in colour where their photographs were used.
+        results: with a surface, or points, or both. Surfaces are reduced to 250,000 faces, points to 200,000.
+        cameras: leading shape (V,), drawn in colour if their images were used.
     """
     import trimesh
     from trimesh.viewer.notebook import scene_to_html
@@ -57,11 +55,11 @@ def make_viewer(results: Results, cameras: CameraTensors) -> str:
     low, high = np.percentile(seen, (3, 97), axis=0)
     middle = (low + high) / 2
     radius = float(np.quantile(np.linalg.norm(seen - middle, axis=1), 0.97)) or 1.0
-    # OpenGL's axes, which three.js has: y up, looking along -z.
-    turn = np.diag([1.0, -1.0, -1.0]) @ E[used[0], :3, :3]
+    # The axes of OpenGL and three.js: y up, looking along -z.
+    rotation = np.diag([1.0, -1.0, -1.0]) @ E[used[0], :3, :3]
 
     def placed(points: np.ndarray) -> np.ndarray:
-        return (points - middle) @ turn.T / radius
+        return (points - middle) @ rotation.T / radius
 
     origins = placed(centers(cameras).double().numpy())
     scene = trimesh.Scene()
@@ -74,15 +72,15 @@ def make_viewer(results: Results, cameras: CameraTensors) -> str:
         chosen = np.random.default_rng(0).permutation(len(points))[:MOST_POINTS]
         cloud = trimesh.PointCloud(placed(points[chosen]), colors=_opaque(results.colours[chosen]))
         scene.add_geometry(cloud, node_name="points", geom_name="points")
-    scene.add_geometry(_frusta(used, K, E, sizes, origins, turn), node_name="cameras", geom_name="cameras")
-    # The script places the camera; without one trimesh would look for a place itself.
+    scene.add_geometry(_frusta(used, K, E, sizes, origins, rotation), node_name="cameras", geom_name="cameras")
+    # The script places the camera; without one trimesh would choose a pose.
     scene.set_camera(angles=(0, 0, 0), distance=3, center=(0, 0, 0))
-    stands = []
+    poses = []
     for view in range(len(K)):
-        axes = E[view, :3, :3] @ turn.T  # rows: right, down, forward
-        halves = 0.5 * sizes[view] / (K[view, 1, 1], K[view, 0, 0])  # tangents of half the field, up and aside
-        stands.append(np.concatenate([origins[view], axes[2], -axes[1], halves]).round(6).tolist())
-    settings = {"first": used[0], "stands": stands, "shaded": surface is not None and surface.colours is None}
+        axes = E[view, :3, :3] @ rotation.T  # rows: right, down, forward
+        halves = 0.5 * sizes[view] / (K[view, 1, 1], K[view, 0, 0])  # tangents of half the fields of view
+        poses.append(np.concatenate([origins[view], axes[2], -axes[1], halves]).round(6).tolist())
+    settings = {"first": used[0], "poses": poses, "shaded": surface is not None and surface.colours is None}
     script = files("lsmgeo.reconstruct").joinpath("viewer.js").read_text("utf-8")
     style = files("lsmgeo.reconstruct").joinpath("viewer.css").read_text("utf-8")
     added = f"<style>{style}</style><script>const settings = {json.dumps(settings)};\n{script}</script></body>"
@@ -95,9 +93,9 @@ def _opaque(colours: np.ndarray) -> np.ndarray:
 
 
 def _frusta(
-    used: Sequence[int], K: np.ndarray, E: np.ndarray, sizes: np.ndarray, origins: np.ndarray, turn: np.ndarray
+    used: Sequence[int], K: np.ndarray, E: np.ndarray, sizes: np.ndarray, origins: np.ndarray, rotation: np.ndarray
 ) -> Path3D:
-    """Pyramids as lines, with a roof over the upper side of the picture."""
+    """Pyramids as lines, with a roof over the upper side of the image."""
     from trimesh.path import Path3D
     from trimesh.path.entities import Line
 
@@ -105,11 +103,11 @@ def _frusta(
     if len(origins) > 1:
         from scipy.spatial import cKDTree
 
-        # Cameras that turned in their place have no gap.
+        # Cameras at one position have no gap.
         gaps = cKDTree(np.unique(origins.round(6), axis=0)).query(origins, k=2)[0].max(1)
         length = float(np.clip(FRUSTUM_OF_GAP * np.median(gaps), 0.1, LONGEST_FRUSTUM))
     lines, colours = [], []
-    # The first is drawn last: it is seen where another stands in its place.
+    # The first is drawn last: it is visible even if another is at the same position.
     for view in sorted(range(len(origins)), key=lambda view: view == used[0]):
         (height, width), origin = sizes[view], origins[view]
         left, right, top, bottom = -0.5, width - 0.5, -0.5, height - 0.5
@@ -118,7 +116,7 @@ def _frusta(
         corners += [(0.7 * left + 0.3 * right, top), ((left + right) / 2, roof), (0.3 * left + 0.7 * right, top)]
         rays = np.array([(x, y, 1) for x, y in corners]) @ np.linalg.inv(K[view]).T
         rays /= max(1.0, float(np.abs(rays[:4, :2]).max()))
-        nodes = np.concatenate([origin[None], origin + length * rays @ E[view, :3, :3] @ turn.T])
+        nodes = np.concatenate([origin[None], origin + length * rays @ E[view, :3, :3] @ rotation.T])
         lines.append(nodes[EDGES])
         colour = REFERENCE if view == used[0] else USED if view in used else UNUSED
         colours.append(np.tile((*colour, 255), (len(EDGES), 1)))
@@ -127,7 +125,7 @@ def _frusta(
 
 
 def _thinned(surface: Mesh) -> Mesh:
-    """Vertices in the same cell of a lattice become one, the coarser the lattice the fewer faces are left."""
+    """A mesh in which the vertices of a cell of a lattice are one; the lattice is as coarse as needed."""
     cells = 512.0
     thin = surface
     low, side = surface.vertices.min(0), float(np.ptp(surface.vertices, axis=0).max())

@@ -1,4 +1,4 @@
-"""What a reconstruction leaves behind: depth maps, pictures, points, a mesh, cameras, and a page."""
+"""Results of a reconstruction and their files: depth maps, images, points, a mesh, cameras, and a page."""
 
 from __future__ import annotations
 
@@ -28,53 +28,53 @@ if TYPE_CHECKING:
     from lsmgeo.data import PosedImages
     from lsmgeo.data.meshes import Mesh
 
-__all__ = ["Looked", "Results", "file_names", "write_results"]
+__all__ = ["Results", "ViewResult", "file_names", "mesh_facts", "write_results"]
 
-# The farthest depth of a map takes that many steps of its 16-bit picture.
+# The largest depth of a map, in steps of its 16-bit image.
 STEPS = 65_000
 LONGEST_NAME = 80
 
 
-class Looked(NamedTuple):
-    """One view of what was reconstructed, all maps of one size (h, w)."""
+class ViewResult(NamedTuple):
+    """The results for one view, all maps of one size (h, w)."""
 
     view: int
     image: torch.Tensor  # (3, h, w)
     camera: CameraTensors  # of that size
-    depth: torch.Tensor  # (h, w), 0 where none is known
-    certain: torch.Tensor  # (h, w) in [0, 1]
-    meaning: str  # of what is certain: "confidence", "silhouette"
+    depth: torch.Tensor  # (h, w), 0 where it is unknown
+    confidence: torch.Tensor  # (h, w) in [0, 1]
+    confidence_name: str  # what it is: "confidence", "silhouette", ...
     numbers: tuple[tuple[str, str], ...]
 
 
 class Results(NamedTuple):
-    """What is written, beside the scene that it is of."""
+    """The results for a scene."""
 
     title: str
     facts: tuple[tuple[str, str], ...]
     notes: tuple[str, ...]
-    views: tuple[Looked, ...] = ()
-    points: np.ndarray = np.empty((0, 3), np.float32)  # (N, 3); none of a hull, whose mesh says all
+    views: tuple[ViewResult, ...] = ()
+    points: np.ndarray = np.empty((0, 3), np.float32)  # (N, 3); none for a hull
     colours: np.ndarray = np.empty((0, 3), np.uint8)  # (N, 3)
     mesh: Mesh | None = None
-    used: tuple[int, ...] = ()  # photographs that helped, beside those of the views
+    used: tuple[int, ...] = ()  # views that were matched, besides those above
 
 
 def write_results(scene: PosedImages, results: Results, folder: str | PathLike[str]) -> dict[str, Path]:
-    """Write results to a folder, where files of the same names are replaced; every file is there whole or not at all.
+    """Write results to a folder, where files of the same names are replaced; no file is left incomplete.
 
-    ``report.html`` is a page with everything, ``summary.png`` one picture of it; ``model.glb`` and ``model.ply`` are
-    the mesh, ``points.ply`` the points. ``images``, ``depth`` and ``pictures`` hold a PNG a view, named after its
-    photograph: the photograph at the size of its depth map, the depth as 16 bit, and in colours. ``cameras.json``
-    states the camera and the step of depth of each (see `lsmgeo.data.read_cameras_json`): the folder is a scene again.
+    ``report.html`` is a page with everything, ``summary.png`` an image of it; ``model.glb`` and ``model.ply`` are the
+    mesh, ``points.ply`` the points. ``images``, ``depth`` and ``pictures`` hold a PNG per view, named after its image:
+    the image at the size of its depth map, the depth as 16 bit, and the depth in colours. ``cameras.json`` has the
+    camera and the step of depth of each (see `lsmgeo.data.read_cameras_json`): the folder is a scene again.
 
-    Everything is made before the first file is written.
+    All contents are computed before the first file is written.
 
     Returns:
-        For each thing where it is.
+        The path of each result.
 
     Raises:
-        DataError: something cannot be written.
+        DataError: a file cannot be written.
     """
     folder = Path(folder)
     names = file_names([scene.names[one.view] for one in results.views])
@@ -97,10 +97,10 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
     summary = result_figures.summary(results.views[0], points, colours, results.title)
     page = make_page(results, scene.names, scene.cameras)
     written = {}
-    # What an earlier run left, and this one does not write again, is not of these results.
+    # Files of an earlier run that this one does not replace do not belong to these results.
     has_mesh, has_points = mesh is not None and len(mesh.faces) > 0, len(results.points) > 0
-    for name, is_there in (("model.glb", has_mesh), ("model.ply", has_mesh), ("points.ply", has_points)):
-        if not is_there:
+    for name, exists in (("model.glb", has_mesh), ("model.ply", has_mesh), ("points.ply", has_points)):
+        if not exists:
             with os_errors_as_data_errors(folder / name, "removed"):
                 (folder / name).unlink(missing_ok=True)
     if mesh is not None and has_mesh:
@@ -114,13 +114,20 @@ def write_results(scene: PosedImages, results: Results, folder: str | PathLike[s
         write_atomic(folder / name, content)
     written["depth, 16 bit"] = folder / "depth"
     written["depth in colours"] = folder / "pictures"
-    # Last, so that it never names what is not there.
+    # Last, so that it never names a missing file.
     written["cameras"] = write_atomic(folder / NAME, encode_cameras(entries))
     return written
 
 
+def mesh_facts(mesh: Mesh | None) -> list[tuple[str, str]]:
+    """The size of a mesh as a fact; nothing for one without faces."""
+    if mesh is None or not len(mesh.faces):
+        return []
+    return [("mesh", f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces")]
+
+
 def file_names(names: Sequence[str]) -> list[str]:
-    """Names for files, without an ending, told from names that may hold folders and any characters; none is twice.
+    """Unique names of files, without extension, from names that may have folders and any characters.
 
     Example:
         >>> file_names(["left/a.png", "a.jpg", "A.png", "../a b:c.png", ""])
@@ -133,7 +140,7 @@ def file_names(names: Sequence[str]) -> list[str]:
         parts = [part for part in path.with_suffix("").parts if part != ".."] if name else []
         plain = re.sub(r"[^\w.-]+", "_", "_".join(parts)).strip("._-")[:LONGEST_NAME] or "view"
         unique, number = plain, 1
-        # Some systems do not tell capitals from small letters.
+        # Some systems ignore case.
         while unique.lower() in taken:
             number += 1
             unique = f"{plain}_{number}"

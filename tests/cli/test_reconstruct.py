@@ -208,7 +208,7 @@ def test_results_never_replace_the_photographs(scene, tmp_path, capsys):
     folder = write_colmap(scene, tmp_path / "scene", form="text")
     before = {path: path.read_bytes() for path in folder.rglob("*.png")}
     assert cli.main(["reconstruct", str(folder), "--out", str(folder)]) == 2
-    assert "out must be a folder without the photographs" in capsys.readouterr().err
+    assert "out must be a folder without the images" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in folder.rglob("*.png")} == before
 
 
@@ -225,7 +225,7 @@ def test_the_error_at_the_sparse_points_is_the_exact_one(scene, tmp_path):
     [
         (["--view", "9"], "view must lie in 0..4; got 9"),
         (["--view=-1"], "view must lie in 0..4; got -1"),
-        (["--view", "nobody.png"], "a photograph's name; got 'nobody.png'"),
+        (["--view", "nobody.png"], "be the name of an image; got 'nobody.png'"),
         (["--density", "0"], "density must lie in"),
         (["--density", "2"], "density must lie in (0, 1]; got 2.0"),
         (["--neighbours", "0"], "neighbours must be a whole number, at least 1; got int 0"),
@@ -286,7 +286,7 @@ def test_a_place_that_cannot_be_written_is_told_before_the_work(folder, tmp_path
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "out"):
         assert cli.main(["reconstruct", str(folder), "--out", str(out)]) == 2
-        assert f"out must be a folder that can be written or made; got '{out}'" in capsys.readouterr().err
+        assert f"out must be a folder that can be written or created; got '{out}'" in capsys.readouterr().err
 
 
 def test_views_of_which_one_end_of_the_range_leaves_nothing_are_left_out(scene, tmp_path, capsys):

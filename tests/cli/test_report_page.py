@@ -11,7 +11,7 @@ from lsmgeo.cameras import CameraTensors, select
 from lsmgeo.data import Mesh
 from lsmgeo.reconstruct.page import make_page
 from lsmgeo.reconstruct.viewer import MOST_FACES, _thinned, make_viewer
-from lsmgeo.reconstruct.write_results import Looked, Results
+from lsmgeo.reconstruct.write_results import Results, ViewResult
 from tests.cli.browser import Browser
 
 HOSTILE = "<script>document.title='taken'</script>\"'&{{ 7 * 7 }}.png"
@@ -54,7 +54,7 @@ def make_views(count, side=120):
     numbers = (("kept", "40 %"),)
     cameras = cameras_around()
     return tuple(
-        Looked(view, image, select(cameras, 0, 0), depth, certain, "confidence", numbers) for view in range(count)
+        ViewResult(view, image, select(cameras, 0, 0), depth, certain, "confidence", numbers) for view in range(count)
     )
 
 
@@ -211,7 +211,7 @@ def test_fifty_views_make_a_page_of_limited_size():
     generator = torch.Generator().manual_seed(0)
     noise = [torch.rand(shape, generator=generator) for shape in ((3, 600, 800), (600, 800), (600, 800))]
     camera = select(cameras_around(), 0, 0)
-    views = tuple(Looked(view, noise[0], camera, *noise[1:], "confidence", ()) for view in range(50))
+    views = tuple(ViewResult(view, noise[0], camera, *noise[1:], "confidence", ()) for view in range(50))
     text = make_page(results_of(views), [str(view) for view in range(50)], cameras_around(50))
     assert len(text) < 20e6
     assert text.count("<section") == 50

@@ -10,7 +10,7 @@ from lsmgeo import VoxelGrid
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.data import Mesh
 from lsmgeo.reconstruct.hull_method import colour_vertices, hull_depth
-from lsmgeo.reconstruct.write_results import Looked
+from lsmgeo.reconstruct.write_results import ViewResult
 
 K = torch.tensor([[20.0, 0.0, 7.5], [0.0, 20.0, 5.5], [0.0, 0.0, 1.0]])
 
@@ -46,6 +46,6 @@ def test_vertices_take_the_colours_of_pictures_up_to_the_border(x):
     vertices = (at.numpy() + 0.01 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])).astype(np.float32)
     mesh = Mesh(vertices, np.array([[0, 2, 1]]))
     picture = torch.tensor([1.0, 0.6, 0.2])[:, None, None].expand(3, 12, 16)
-    view = Looked(0, picture, camera_at(0.0), torch.full((12, 16), 2.0), torch.ones(12, 16), "silhouette", ())
+    view = ViewResult(0, picture, camera_at(0.0), torch.full((12, 16), 2.0), torch.ones(12, 16), "silhouette", ())
     coloured = colour_vertices(mesh, [view], 0.1)
     assert coloured.colours[0].tolist() == [255, 153, 51]

@@ -16,7 +16,7 @@ from lsmgeo.data.shards.shape_sources import Synthetic13
 from lsmgeo.errors import OptionError
 from lsmgeo.models import DepthResult, VoxelResult, create, write_weights
 from lsmgeo.reconstruct.learnt_method import learnt_results, predict_scene
-from lsmgeo.reconstruct.object_frame import frame_view, in_model_frame, place_box, place_object, spread_views
+from lsmgeo.reconstruct.object_frame import crop_view, estimate_object_box, frame_of_box, in_model_frame, spread_views
 
 
 def rotation(axis, degrees):
@@ -88,7 +88,7 @@ def test_a_moved_scene_gives_the_occupancies_of_the_models_own_frame(sample, fol
     model = create("voxel-lsm", preset="tiny")
     found = predict_scene(data.open(folder), model)
     assert sorted(found.views) == [0, 1, 2, 3, 4, 5]
-    np.testing.assert_allclose(found.placement.scene_from_model().numpy(), MOVED, atol=1e-5)
+    np.testing.assert_allclose(found.frame.scene_from_model().numpy(), MOVED, atol=1e-5)
     expected = model.run(*batch_of(sample, found.views)).occupancy
     torch.testing.assert_close(found.result.occupancy, expected, rtol=1e-4, atol=1e-5)
     assert expected.std() > 1e-3
@@ -118,8 +118,8 @@ def test_voxels_come_back_into_the_scene(sample, folder, weights, monkeypatch):
         both = mask & on
         # Voxels are 1/16 of 7.
         assert (one.depth[both] - 7 * sample.depth[one.view][both]).abs().median() < 7 / 16
-        assert one.certain[on].min() > 0.1
-        assert one.certain[on].mean() > 2 * one.certain[~on].mean()
+        assert one.confidence[on].min() > 0.1
+        assert one.confidence[on].mean() > 2 * one.confidence[~on].mean()
     # The chair has its colours.
     assert results.mesh.colours.std() > 5
 
@@ -151,7 +151,7 @@ def test_depth_comes_back_into_the_scene(sample, folder, weights, monkeypatch):
     pixels = np.rint(seen @ K.T / seen[:, 2:])[:, :2].astype(int)
     depth = sample.depth[read[0][0]].numpy()[pixels[:, 1].clip(0, 31), pixels[:, 0].clip(0, 31)]
     own = np.abs(seen[:, 2] - depth) < 1e-4
-    assert own.sum() >= (results.views[0].certain > 0).sum() > 50
+    assert own.sum() >= (results.views[0].confidence > 0).sum() > 50
     vertices = moved(results.mesh.vertices.astype(float), inverse)
     distances = np.linalg.norm(vertices[:, None] - points[None], axis=-1).min(1)
     assert np.median(distances) < 0.05
@@ -184,11 +184,11 @@ def test_windows_keep_geometry():
     for focal, middle, size in (((150.0, 170.0), (90.0, 50.0), (120, 160)), ((60.0, 60.0), (10.0, 33.0), (70, 60))):
         K = [[focal[0], 0.7, middle[0]], [0.0, focal[1], middle[1]], [0.0, 0.0, 1.0]]
         scene = Scene(size, K)
-        placement = place_box(scene, (1.1, 2.0, 2.9, 2.0))
-        framed = frame_view(scene, 0, placement, 24)
+        frame = frame_of_box(scene, (1.1, 2.0, 2.9, 2.0))
+        framed = crop_view(scene, 0, frame, 24)
         assert framed.image.shape == (3, 24, 24)
         # The cube's middle is in the middle, as large as in training.
-        camera = in_model_frame(framed.camera, placement)
+        camera = in_model_frame(framed.camera, frame)
         pixel = camera.intrinsics @ camera.cam_from_world[:3, 3]
         pixel = (pixel / pixel[2])[:2].numpy()
         np.testing.assert_allclose(pixel, 11.5, atol=0.5)
@@ -238,10 +238,10 @@ def test_up_is_told_by_the_cameras():
     for seed, cameras in enumerate([around([0.0, 80.0, 200.0], [10.0, -20.0, 30.0]), around([5.0, 6.0], [0.0, 0.0])]):
         for axis, degrees in (((1, 0, 0), 90), ((0, 0, 1), 180), ((1, 2, -1), 130)):
             R = rotation(axis, degrees)
-            found = place_box(scene_of(turned_by(cameras, R)), (0, 0, 0, 1)).turn
+            found = frame_of_box(scene_of(turned_by(cameras, R)), (0, 0, 0, 1)).rotation
             np.testing.assert_allclose(found @ R @ (0, 1, 0), (0, 1, 0), atol=1e-9, err_msg=f"{seed} {axis}")
             np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(place_box(scene_of(cameras), (0, 0, 0, 1)).turn, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(frame_of_box(scene_of(cameras), (0, 0, 0, 1)).rotation, np.eye(3), atol=1e-9)
 
 
 def test_the_object_is_told_by_points_then_by_where_cameras_look():
@@ -250,27 +250,27 @@ def test_the_object_is_told_by_points_then_by_where_cameras_look():
     cameras = around([0.0, 70.0, 150.0, 260.0], [10.0, 20.0, -5.0, 15.0], 9.0, tuple(target))
     inside = target + (rng.random((4000, 3)) - 0.5) * (3.0, 0.5, 1.0) @ spun.T
     beyond = target + rng.normal(size=(500, 3)) * 40
-    by_points = place_object(scene_of(cameras, np.concatenate([inside, beyond])), None, range(4))
-    assert by_points.told_by == "sparse points"
+    by_points = estimate_object_box(scene_of(cameras, np.concatenate([inside, beyond])), None, range(4))
+    assert by_points.inferred_from == "sparse points"
     np.testing.assert_allclose(by_points.center, target, atol=0.15)
     assert by_points.side == pytest.approx(np.sqrt(3.0**2 + 0.5**2 + 1.0), rel=0.1)
     # Its box stands along the axes again.
-    corner = by_points.turn @ spun
+    corner = by_points.rotation @ spun
     np.testing.assert_allclose(np.sort(np.abs(corner).max(0)), 1.0, atol=5e-3)
-    by_cameras = place_object(scene_of(cameras), None, range(4))
-    assert by_cameras.told_by == "the point that the cameras look at"
+    by_cameras = estimate_object_box(scene_of(cameras), None, range(4))
+    assert by_cameras.inferred_from == "the point that the cameras look at"
     np.testing.assert_allclose(by_cameras.center, target, atol=1e-9)
     assert by_cameras.side == pytest.approx(4.5)  # at a distance of 2 sides, as in training
     with pytest.raises(OptionError, match="give box"):
-        place_object(scene_of(around([10.0], [10.0])), None, range(1))
+        estimate_object_box(scene_of(around([10.0], [10.0])), None, range(1))
 
 
 def test_views_are_from_all_around():
     cameras = around([0.0, 5.0, 10.0, 90.0, 95.0, 180.0, 185.0, 270.0], [0.0] * 8)
     scene = scene_of(cameras)
-    placement = place_box(scene, (0, 0, 0, 1))
-    assert spread_views(scene, placement, range(8), 2) == [0, 5]
-    chosen = spread_views(scene, placement, [3, 0, 1, 2, 5, 7], 4)
+    frame = frame_of_box(scene, (0, 0, 0, 1))
+    assert spread_views(scene, frame, range(8), 2) == [0, 5]
+    chosen = spread_views(scene, frame, [3, 0, 1, 2, 5, 7], 4)
     assert chosen[:2] == [3, 7]
     assert sorted(chosen) == [0, 3, 5, 7]
 
@@ -280,11 +280,11 @@ def test_views_are_from_all_around():
     [
         ({"weights": None}, "method v-lsm needs weights"),
         ({"weights": "depth-lsm"}, "needs weights of a voxel-lsm; .* holds those of a depth-lsm: use method d-lsm"),
-        ({"weights": "r2n2"}, "holds those of a r2n2: no method of reconstruct takes these"),
+        ({"weights": "r2n2"}, "holds those of a r2n2: no method of reconstruct uses these"),
         ({"method": "d-lsm"}, "needs weights of a depth-lsm; .* use method v-lsm"),
         ({"box": "0,0,1"}, "box must be x,y,z,side"),
         ({"box": "0,0,0,-1"}, "box must be x,y,z,side"),
-        ({"box": "900,0,0,1"}, "no photograph shows the middle of the object"),
+        ({"box": "900,0,0,1"}, "no image shows the centre of the object"),
         ({"threshold": 1.0}, "threshold must be a number between 0 and 1"),
         ({"views": 0}, "views must be a whole number"),
         ({"background": "1,a,0"}, "three numbers such as"),
@@ -302,14 +302,14 @@ def test_without_silhouettes_a_warning_and_the_cameras_word(sample, tmp_path, we
     found = predict_scene(scene, create("voxel-lsm", preset="tiny"), views=3)
     assert len(found.views) == 3
     assert "No silhouettes" in found.notes[0]
-    assert found.placement.told_by == "the point that the cameras look at"
-    np.testing.assert_allclose(found.placement.scene_from_model().numpy(), MOVED, atol=1e-4)
+    assert found.frame.inferred_from == "the point that the cameras look at"
+    np.testing.assert_allclose(found.frame.scene_from_model().numpy(), MOVED, atol=1e-4)
     far = predict_scene(scene, create("voxel-lsm", preset="tiny"), views=3, box=(30.0, -200.0, 5.0, 1.0))
     assert "14.0 sizes of the object away" in far.notes[1]
     # By the colour behind it the object is told, and nothing is to be warned of.
     found = predict_scene(scene, create("voxel-lsm", preset="tiny"), views=3, background="white")
     assert found.notes == ()
-    assert found.placement.told_by == "silhouettes and cameras"
+    assert found.frame.inferred_from == "silhouettes and cameras"
 
 
 @pytest.mark.parametrize("method", ["v-lsm", "d-lsm"])

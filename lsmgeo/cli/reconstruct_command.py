@@ -85,9 +85,9 @@ def reconstruct(
     Returns:
         The exit status: 0, or 1 if nothing was reconstructed.
     """
-    sweep = {"neighbours": neighbours, "planes": planes, "spacing": spacing, "near": near, "far": far, "score": score}
-    sweep |= {"window": window, "density": density, "memory": memory << 20, "check": check}
-    silhouettes = {"masks": masks, "background": background}
+    sweep: dict[str, Any] = {"neighbours": neighbours, "planes": planes, "spacing": spacing, "near": near, "far": far}
+    sweep |= {"score": score, "window": window, "density": density, "memory": memory << 20, "check": check}
+    silhouettes: dict[str, Any] = {"masks": masks, "background": background}
     learnt = silhouettes | {"weights": weights, "views": views, "box": box, "threshold": threshold}
     options = {"sweep": sweep, "hull": silhouettes | {"rule": rule}}.get(method, learnt | {"method": method})
     _check_options(method, sweep | learnt)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from os import PathLike
 from pathlib import Path
 
 from lsmgeo import data
@@ -17,7 +16,7 @@ MOST_NAMED = 5
 
 
 def open_scene(
-    path: str | PathLike[str], view: int | str | None, out: str | PathLike[str]
+    path: str | Path, view: int | str | None, out: str | Path
 ) -> tuple[PosedImages, int | None, tuple[str, ...]]:
     """Open a scene and find one of its views.
 

@@ -102,7 +102,7 @@ def test_what_cannot_be_evaluated_is_told_in_one_line(weights, tmp_path, capsys,
         ("pose-noise", "voxel-lsm,r2n2-pose", 1),
         ("order", "voxel-lsm", 1),
         ("sequences", "voxel-lsm,r2n2-pose", 3),
-        ("depth", "depth-lsm", 0),
+        ("depth", "depth-lsm", 1),
         ("clouds", "depth-lsm", 2),
     ],
 )

@@ -1,4 +1,4 @@
-"""Reconstruction without learning, on the library's own operators."""
+"""Reconstruction without learning, with the operators of the library."""
 
 from lsmgeo.classical.consistency import consistent_views
 from lsmgeo.classical.depth_range import find_depth_range

@@ -26,33 +26,33 @@ def consistent_views(
 ) -> Tensor:
     """Count the other depth maps that agree with one, pixel by pixel.
 
-    Equation: the point X of pixel p at depth d is seen in the other view at q; the point that the other map has at q,
-    seen back in the first view, lies at p' with depth d'. They agree where ``|p' - p| <= pixels`` and
-    ``|d' - d| <= relative d`` (Yao et al., "MVSNet", ECCV 2018, section 4.2). The other map is read between its pixels
-    by interpolating inverse depth, which is exact on planes, and where one of the four has no depth, not at all.
+    Equation: the point X of pixel p at depth d projects to q in the other view; the point that the other map has at q,
+    projected back into the first view, is at p' with depth d'. They agree where ``|p' - p| <= pixels`` and
+    ``|d' - d| <= relative d`` (Yao et al., "MVSNet", ECCV 2018, section 4.2). Between the
+    pixels of the other map inverse depth is interpolated, which is exact on planes; a sample next to a pixel without
+    depth is not used.
 
     Convention:
-        Depth is camera z, 0 where there is none. Integer pixel centres; a depth map of another size than its camera's
-        image is resized for.
+        Depth is camera z, 0 where there is none. Integer pixel centres; cameras are resized to the depth maps.
 
     Args:
-        depth: (h, w) of the view that is checked.
+        depth: (h, w) of the view to check.
         camera: its camera, leading shape ().
         other_depths: (h', w') each, of any size.
         other_cameras: their cameras, leading shape () each.
-        pixels: largest distance of the pixel that comes back.
-        relative: largest difference of the depth that comes back, as a fraction.
+        pixels: largest distance between p' and p.
+        relative: largest relative difference between d' and d.
 
     Returns:
         (h, w) int64, from 0 to the number of other views; 0 where `depth` is. Not differentiable.
 
     Raises:
-        ShapeError, DTypeError: as many cameras as depth maps are needed, and each map must be (h, w).
+        ShapeError, DTypeError: the numbers of cameras and depth maps differ, or a map is not (h, w).
         OptionError: a tolerance that is not positive.
 
     Example:
         >>> import torch
-        >>> from lsmgeo.cameras import CameraTensors, centers, project, resize, unproject_depth
+        >>> from lsmgeo.cameras import CameraTensors
         >>> from lsmgeo.classical import consistent_views
         >>> K = torch.tensor([[4.0, 0.0, 1.5], [0.0, 4.0, 1.0], [0.0, 0.0, 1.0]])
         >>> E = torch.eye(4)
@@ -86,7 +86,7 @@ def consistent_views(
             seen_by = resize(other_camera.to(torch.float64), *other.shape)
             place, z, _ = (part[0, 0] for part in project(seen_by.at(None), points))
             found = _depth_at(other, place, z, known)
-            # What the other map has there is on the same ray from the other camera, at another depth.
+            # The point of the other map is on the same ray of the other camera, at another depth.
             factor, center = found / torch.where(z > 0, z, 1.0), centers(seen_by)
             back, distance, _ = (part[0, 0] for part in project(camera, center + factor[:, None] * (points - center)))
             agree = ((back - own).norm(dim=-1) <= pixels) & ((distance - start).abs() <= relative * start)
@@ -95,10 +95,10 @@ def consistent_views(
 
 
 def _depth_at(depth: Tensor, pixels: Tensor, z: Tensor, known: Tensor) -> Tensor:
-    """Depth (N,) of a map between its pixels, 0 where one of the four around has none."""
+    """Depth (N,) of a map between its pixels, 0 where one of the four neighbours has none."""
     has = depth > 0
     layers = torch.stack((torch.where(has, 1 / torch.where(has, depth, 1.0), 0.0), has.to(depth.dtype)))
-    # Fused depths are float32; the interpolation of their inverses is not, so that planes stay planes.
+    # Inverse depths are interpolated in float64, so that planes stay planes.
     sampled = functional.sample_views(
         layers.double()[None, None], pixels[None, None], z[None, None], (known & (z > 0))[None, None]
     ).volume[0, 0]

@@ -1,7 +1,7 @@
-"""Correlation costs plane by plane, by OpenCV's box filter in memory that is used again: fast, without derivatives.
+"""Correlation costs plane by plane, with OpenCV's box filter in reused memory: fast, without derivatives.
 
-It does what `lsmgeo.classical.matching` does with tensor operations; those make a fresh array at every step, and
-fresh memory costs as much as the arithmetic.
+`lsmgeo.classical.matching` computes the same with tensor operations, which allocate an array at every step; that takes
+as long as the arithmetic.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ __all__ = ["INVALID_COST", "Correlation", "on_threads"]
 Floats = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
-# What unrelated patches cost on average, and places that nobody sees.
+# The mean cost of unrelated patches, and the cost of sites that no neighbour sees.
 INVALID_COST = 1.0
 
 
 def on_threads(task: Callable[[int], None], numbers: Iterable[int]) -> None:
-    """Do a task for every number on as many threads as PyTorch uses; NumPy and OpenCV let go of Python's lock."""
+    """Run a task for every number on as many threads as PyTorch uses; NumPy and OpenCV release Python's lock."""
     threads = torch.get_num_threads()
     if threads == 1:
         for number in numbers:
@@ -48,9 +48,9 @@ class Correlation:
     def __init__(self, reference: Tensor, window: int, noise: float):
         self.reference: Floats = np.ascontiguousarray(reference.numpy())
         self.window, self.noise = window, noise
-        self.rooms = threading.local()
+        self.buffers = threading.local()
         height, width = self.reference.shape
-        # OpenCV counts the pixels beyond the border as zeros.
+        # OpenCV pads with zeros beyond the border.
         self.edges = [_edges(height, window), _edges(width, window)]
         self.mean, energy = np.empty_like(self.reference), np.empty_like(self.reference)
         self._average(self.reference, self.mean)
@@ -58,34 +58,34 @@ class Correlation:
         spread = np.maximum(energy - self.mean**2, 0) + np.float32(noise**2)
         self.scale: Floats = -1 / np.sqrt(spread)
 
-    def _room(self, arrays: int) -> Floats:
-        """(arrays, h, w) of the calling thread, with any values."""
-        room = getattr(self.rooms, "room", None)
-        if room is None or len(room) < arrays:
-            room = self.rooms.room = np.empty((arrays, *self.reference.shape), np.float32)
-        return room[:arrays]
+    def _buffer(self, arrays: int) -> Floats:
+        """Memory (arrays, h, w) of the calling thread, uninitialised."""
+        buffer = getattr(self.buffers, "values", None)
+        if buffer is None or len(buffer) < arrays:
+            buffer = self.buffers.values = np.empty((arrays, *self.reference.shape), np.float32)
+        return buffer[:arrays]
 
     def _average(self, values: Floats, out: Floats) -> None:
         import cv2
 
         cv2.boxFilter(values, -1, (self.window, self.window), dst=out, borderType=cv2.BORDER_CONSTANT)
-        (rows, columns) = self.edges
+        rows, columns = self.edges
         for part, factors in rows:
             out[part] *= factors[:, None]
         for part, factors in columns:
             out[:, part] *= factors
 
-    def _correlate(self, warped: Floats, out: Floats, room: Floats) -> None:
-        """Write the costs less 1."""
+    def _correlate(self, warped: Floats, out: Floats, buffer: Floats) -> None:
+        """Write the costs minus 1."""
         import cv2
 
-        mean, energy, product = room[:3]
+        mean, energy, product = buffer[:3]
         self._average(warped, mean)
         np.multiply(warped, warped, out=product)
         self._average(product, energy)
         np.multiply(mean, mean, out=product)
         cv2.addWeighted(energy, 1, product, -1, self.noise**2, dst=energy)
-        # A variance of 0 may come out as a little less.
+        # By rounding, a variance of 0 may be slightly negative.
         np.maximum(energy, np.float32(self.noise**2), out=energy)
         np.sqrt(energy, out=energy)
         np.multiply(warped, self.reference, out=out)
@@ -96,54 +96,52 @@ class Correlation:
         np.divide(product, energy, out=out)
 
     def aggregate(self, warped: Floats, visible: Mask, best: int, min_views: int, out: Floats, seen: Mask) -> None:
-        """Write the mean cost (h, w) of the best neighbours, and where enough see a site, for one plane.
+        """Write the mean cost (h, w) of the best neighbours, and where enough neighbours see a site, for one plane.
 
         Args:
             warped: (N, h, w) of all neighbours.
             visible: (N, h, w).
             best: see `lsmgeo.classical.aggregate_views`.
-            min_views: likewise.
+            min_views: see there.
             out: (h, w), written.
             seen: (h, w), written.
         """
         number = len(warped)
-        room = self._room(number + 4)
-        costs, spare = list(room[4:]), room[3]
+        buffer = self._buffer(number + 4)
+        costs, spare = list(buffer[4:]), buffer[3]
         for neighbour in range(number):
-            self._correlate(warped[neighbour], costs[neighbour], room)
+            self._correlate(warped[neighbour], costs[neighbour], buffer)
         all_see = bool(visible.all())
         if not all_see:
             for cost, sees in zip(costs, visible, strict=True):
                 np.copyto(cost, np.inf, where=~sees)
-        # The lowest `best` bubble to the front, one after another.
+        # Partial bubble sort: the lowest `best` costs move to the front.
         for first in range(best):
             for place in range(number - 1, first, -1):
                 np.minimum(costs[place - 1], costs[place], out=spare)
                 if first < best - 1:
                     np.maximum(costs[place - 1], costs[place], out=costs[place])
                 costs[place - 1], spare = spare, costs[place - 1]
-        if all_see:
-            seen[:] = True
-            total = costs[0]
-            for cost in costs[1:best]:
-                np.add(total, cost, out=total)
-            np.multiply(total, np.float32(1 / best), out=out)
-            np.add(out, 1, out=out)
-            return
-        count = np.add.reduce(visible.view(np.uint8), axis=0, dtype=np.uint8 if number < 256 else np.int32)
-        np.greater_equal(count, min_views, out=seen)
-        for place, cost in enumerate(costs[:best]):
-            np.copyto(cost, 0, where=count <= place)
+        if not all_see:
+            count = np.add.reduce(visible.view(np.uint8), axis=0, dtype=np.uint8 if number < 256 else np.int32)
+            for place, cost in enumerate(costs[:best]):
+                np.copyto(cost, 0, where=count <= place)
         total = costs[0]
         for cost in costs[1:best]:
             np.add(total, cost, out=total)
-        np.divide(total, np.clip(count, 1, best).astype(np.float32), out=out)
+        if all_see:
+            seen[:] = True
+            np.multiply(total, np.float32(1 / best), out=out)
+        else:
+            np.greater_equal(count, min_views, out=seen)
+            np.divide(total, np.clip(count, 1, best).astype(np.float32), out=out)
         np.add(out, 1, out=out)
-        np.copyto(out, np.float32(INVALID_COST), where=~seen)
+        if not all_see:
+            np.copyto(out, np.float32(INVALID_COST), where=~seen)
 
 
 def _edges(length: int, window: int) -> list[tuple[slice, Floats]]:
-    """The places near both ends of a line where windows are cut, and by what means over them grow."""
+    """The slices at both ends of a line where windows are cut off, and the factors that correct the means there."""
     radius = window // 2
     places = np.arange(length)
     count = np.minimum(places + radius, length - 1) - np.maximum(places - radius, 0) + 1

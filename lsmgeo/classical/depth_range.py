@@ -1,4 +1,4 @@
-"""Between which depths a view is swept, where nobody says and nothing was measured: a coarse sweep looks for them."""
+"""The depth range of a sweep if none is given or measured: a coarse sweep finds it."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from lsmgeo.data import PosedImages
 
 __all__ = ["find_depth_range"]
 
-# Planes of the coarse sweep, views it matches at most, and how much nearer and farther it looks than the cameras tell.
+# Planes and neighbours of the coarse sweep, and its range in units of the depth that the cameras imply.
 PLANES, NEIGHBOURS = 160, 4
 NEARER, FARTHER = 0.3, 4.0
-# The best pixels that are believed, how certain they must be, and the least fraction that says anything.
+# The density and the confidence of the pixels that are used, and the least fraction of the pixels that must remain.
 DENSITY, CONFIDENCE, LEAST = 0.8, 0.3, 0.02
 MARGIN = 0.15
 
@@ -32,15 +32,15 @@ def find_depth_range(
 ) -> tuple[float, float]:
     """Nearest and farthest depth of what a view shows.
 
-    From sparse points or measured depth where there are any (`lsmgeo.classical.default_depth_range`). Else a sweep of
-    the reduced photograph, from far nearer to far farther than the place that the cameras look at; the range is
-    that of its most certain pixels (their 1st and 99th percentile in inverse depth, widened). Where too few are
-    certain, the place where the optical axes meet decides, as there.
+    From sparse points or measured depth if the scene has them (`lsmgeo.classical.default_depth_range`). If not, from a
+    sweep of the reduced image in a range far wider than the one that the cameras imply: the 1st and 99th percentile of
+    the inverse depth of its most confident pixels, widened. If too few pixels are confident, from the cameras, as in
+    that function.
 
     Args:
-        scene: the posed photographs.
+        scene: posed images.
         view: index of the view.
-        size: longer side of the reduced photograph in pixels.
+        size: longer side of the reduced image in pixels.
         noise: standard deviation of luminance that counts as no texture.
         memory: bound in bytes on what the sweep adds to the process.
 
@@ -48,8 +48,8 @@ def find_depth_range(
         Camera z, world units.
 
     Raises:
-        OptionError: the depth cannot be told, or the view has no neighbours.
-        DataError: a photograph cannot be read.
+        OptionError: the depth cannot be inferred, or the view has no neighbours.
+        DataError: an image cannot be read.
     """
     measured = measured_depth_range(scene, view)
     if measured is not None:

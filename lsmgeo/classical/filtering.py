@@ -15,10 +15,10 @@ __all__ = ["guided_filter"]
 
 
 def guided_filter(image: Tensor, *, radius: int = 6, eps: float = 1e-4) -> Callable[[Tensor], Tensor]:
-    """Make a filter that averages matching costs over a window, but not across the edges of a picture.
+    """Make a filter that averages matching costs over a window, but not across the edges of an image.
 
     Equation: each plane p becomes ``mean(a) I + mean(b)``, with ``a = cov(I, p) / (var(I) + eps)`` and
-    ``b = mean(p) - a mean(I)`` in every window, I the picture's colours (He, Sun and Tang, "Guided image filtering",
+    ``b = mean(p) - a mean(I)`` in every window, I the colours of the image (He, Sun and Tang, "Guided image filtering",
     2013, equations 14 to 16; on matching costs: Hosni et al., "Fast cost-volume filtering for visual correspondence
     and beyond", 2013). Computed by ``cv2.ximgproc``.
 
@@ -28,14 +28,14 @@ def guided_filter(image: Tensor, *, radius: int = 6, eps: float = 1e-4) -> Calla
         eps: variance of colour above which a window holds an edge.
 
     Returns:
-        A function of (d, h, w) planes, which returns as many; on the CPU, not differentiable.
+        A function from planes (d, h, w) to filtered planes (d, h, w); on the CPU, not differentiable.
 
     Raises:
         ShapeError, DTypeError: an image of another shape or dtype; later, planes of another size than the image.
         OptionError: a radius below 1, or an ``eps`` that is not positive.
 
     Example:
-        A plane with a step where the picture has one keeps it, noise beside it goes:
+        A step where the image has one is kept, noise beside it is removed:
 
         >>> import torch
         >>> from lsmgeo.classical import guided_filter

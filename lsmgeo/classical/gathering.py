@@ -1,4 +1,4 @@
-"""A reference photograph and its neighbours, at one size."""
+"""A reference image and its neighbours, at one size."""
 
 from __future__ import annotations
 
@@ -15,20 +15,18 @@ __all__ = ["fitted", "gather", "resized"]
 
 
 def gather(scene: PosedImages, views: Sequence[int], size: int) -> tuple[Tensor, CameraTensors]:
-    """Load photographs at the size of the first.
-
-    All take the reference's size; the resize rule keeps cameras exact, even where aspects differ.
+    """Load images at the size of the first; cameras are resized with them, even if aspect ratios differ.
 
     Args:
-        scene: the posed photographs.
-        views: which, the reference first.
-        size: longer side of the reference in pixels; photographs are never enlarged for it.
+        scene: posed images.
+        views: their indices, the reference first.
+        size: longer side of the reference in pixels; it is never enlarged.
 
     Returns:
         (V, 3, h, w) RGB in [0, 1], and their cameras, leading shape (V,).
 
     Raises:
-        DataError: a photograph cannot be read.
+        DataError: an image cannot be read.
     """
     shape = fitted(scene.size(views[0]), size)
     images = torch.stack([resized(scene.load(view), shape) for view in views])
@@ -36,13 +34,13 @@ def gather(scene: PosedImages, views: Sequence[int], size: int) -> tuple[Tensor,
 
 
 def fitted(size: Sequence[int], longest: int) -> tuple[int, int]:
-    """(h, w) whose longer side is brought to so many pixels; it is never enlarged."""
+    """The size (h, w) with a longer side of ``longest`` pixels; never enlarged."""
     scale = min(1.0, longest / max(size))
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
 def resized(image: Tensor, shape: tuple[int, int]) -> Tensor:
-    """An image (C, H, W) in [0, 1] at the size (h, w), smoothed where it shrinks."""
+    """An image (C, H, W) in [0, 1] at the size (h, w), antialiased where it shrinks."""
     if tuple(image.shape[1:]) == shape:
         return image
     return interpolate(image[None], shape, mode="bilinear", antialias=True)[0].clamp(0, 1)

@@ -1,4 +1,4 @@
-"""How unlike a reference image and its neighbours are at every plane of the reference's frustum."""
+"""Matching costs of a reference image and its neighbours, at every plane of the frustum of the reference."""
 
 from __future__ import annotations
 
@@ -39,37 +39,38 @@ def matching_costs(
     window: int = 5,
     noise: float = 2 / 255,
 ) -> MatchingCosts:
-    """Compare every neighbour with the reference, the first view, at every plane of the reference's frustum.
+    """Compare every neighbour with the reference, the first view, at every plane of its frustum.
 
-    Every neighbour is warped onto every plane and patches of the warped image are compared with those of the
-    reference, so that a patch turns, scales and foreshortens as the view does (Collins, "A space-sweep approach to
-    true multi-image matching", CVPR 1996). Equation, with means E over a patch's pixels, r of the reference, s warped:
+    Every neighbour is warped onto every plane, and patches of the warped image are compared with those of the
+    reference, so that patches are rotated, scaled and foreshortened as the view is (Collins, "A space-sweep approach to
+    true multi-image matching", CVPR 1996). Equation, with means E over the pixels of a patch, r of the reference, s
+    warped:
 
     - "zncc": ``1 - cov(r, s) / sqrt((var r + noise^2) (var s + noise^2))`` of luminances, in [0, 2]: one minus the
-      zero-mean normalised cross-correlation, where a patch without texture resembles nothing, not even another one;
+      zero-mean normalised cross-correlation, so that a patch without texture matches nothing, not even another one;
     - "sad": ``E |r - s|``, the mean absolute difference over all channels;
-    - "census": twice the fraction of a patch's pixels that are darker than its centre in one image alone, in [0, 2]
-      (Zabih and Woodfill, "Non-parametric local transforms", ECCV 1994), of luminances;
+    - "census": twice the fraction of the pixels of a patch that are darker than its centre in only one of the images,
+      in [0, 2] (Zabih and Woodfill, "Non-parametric local transforms", ECCV 1994), of luminances;
     - "cosine": ``1 - E r.s / sqrt((E r.r + noise^2) (E s.s + noise^2))``, in [0, 2], for learned features.
 
     Convention:
-        Depth is camera z of the first view. Integer pixel centres. At the border a patch is what of it exists. A
-        neighbour that does not reach a site is not `visible` there; its cost is that of its nearest pixels.
+        Depth is camera z of the first view. Integer pixel centres. At the border, patches are cut off. Where
+        a site is outside a neighbour, it is not `visible`, and its cost is that of the nearest pixels.
 
     Args:
         images: (V, C, h, w), the reference first: C = 1 grey, C = 3 RGB, any C of features for "cosine" and "sad".
-        cameras: leading shape (V,), of the images as they are or of the originals, whatever their sizes.
+        cameras: leading shape (V,), of images of any sizes; they are resized to (h, w).
         depths: (P,) camera z in the reference, world units, positive, ascending.
         score: "zncc", "sad", "census" or "cosine".
-        window: side of the patches in pixels of the reference, odd; 1 is a single pixel.
-        noise: standard deviation of the values below which texture counts for little; positive.
+        window: side of the patches in pixels of the reference, odd; 1 compares single pixels.
+        noise: standard deviation below which texture has little weight; positive.
 
     Returns:
-        `MatchingCosts`: costs (V-1, P, h, w) of the images' dtype, and visible (V-1, P, h, w). Differentiable in
+        `MatchingCosts`: costs (V-1, P, h, w) of the dtype of the images, and visible (V-1, P, h, w). Differentiable in
         images, cameras and depths ("census" is constant).
 
     Raises:
-        OptionError: an unknown score, an even window, no noise.
+        OptionError: an unknown score, an even window, noise that is not positive.
         ShapeError, DTypeError, DeviceError, CameraError, GridError: as `lsmgeo.functional.unproject`.
 
     Example:
@@ -77,7 +78,7 @@ def matching_costs(
         >>> from lsmgeo.cameras import CameraTensors
         >>> K = torch.tensor([[8.0, 0.0, 3.5], [0.0, 8.0, 3.5], [0.0, 0.0, 1.0]]).expand(2, 3, 3)
         >>> E = torch.eye(4).repeat(2, 1, 1)
-        >>> E[1, 0, 3] = -1.0  # the second camera stands one unit to the right: 8 / depth pixels of disparity
+        >>> E[1, 0, 3] = -1.0  # the second camera is one unit to the right: 8 / depth pixels of disparity
         >>> left = torch.rand(1, 8, 8, generator=torch.Generator().manual_seed(0))
         >>> images = torch.stack((left, left.roll(-2, -1)))
         >>> costs, visible = matching_costs(images, CameraTensors(K, E, 8, 8), torch.tensor([2.0, 4.0, 8.0]), window=3)
@@ -91,21 +92,18 @@ def matching_costs(
     return MatchingCosts(_comparison(options, reference)(volume), visible)
 
 
-class Warped(NamedTuple):
-    """The neighbours warped onto the planes of the reference's frustum, slab by slab."""
-
-    reference: Tensor  # (C, h, w)
-    slabs: Iterator[tuple[int, Tensor, Tensor]]  # first plane, (V-1, C, d, h, w), visible (V-1, d, h, w)
-
-
 def warp_neighbours(
     images: Tensor,
     cameras: Cameras,
     depths: Tensor,
     planes_per_slab: int,
     options: SweepOptions,
-) -> Warped:
-    """Check the tensors of `matching_costs`, and warp that many planes at a time."""
+) -> tuple[Tensor, Iterator[tuple[int, Tensor, Tensor]]]:
+    """Check the tensors of `matching_costs`, and warp the neighbours, some planes at a time.
+
+    Returns:
+        The reference (C, h, w), and slabs: first plane, neighbours (V-1, C, d, h, w), visible (V-1, d, h, w).
+    """
     who = "matching_costs"
     check_float(who, "images", images, "(V, C, h, w)", rank=4)
     if images.shape[0] < 2:
@@ -120,16 +118,16 @@ def warp_neighbours(
     if options.score in ("zncc", "census"):
         images = luminance(images)
     if options.score == "zncc":
-        # Correlation ignores an offset; without it squares lose less to rounding.
+        # Correlation ignores an offset; without it squares have smaller rounding errors.
         images = images - images[0].detach().mean()
     others = tensors.at(slice(1, None))
     grid = FrustumGrid(tensors.at(0), depths, (images.shape[2], images.shape[3]))
     slabs = functional.unproject_slabs(images[None, 1:], others, grid, max(1, planes_per_slab), padding_mode="border")
-    return Warped(images[0], ((start, volume[0], visible[0]) for start, volume, visible in slabs))
+    return images[0], ((start, volume[0], visible[0]) for start, volume, visible in slabs)
 
 
 def luminance(images: Tensor) -> Tensor:
-    """Grey values (V, 1, h, w) of RGB images; grey images are themselves.
+    """Grey values (V, 1, h, w) of RGB images; grey images are returned as they are.
 
     Raises:
         ShapeError: neither 1 nor 3 channels.
@@ -172,7 +170,7 @@ def _comparison(options: SweepOptions, reference: Tensor) -> Callable[[Tensor], 
 
 
 def window_means(values: Tensor, window: int) -> Tensor:
-    """Means (..., h, w) over window x window pixels, at the border over those that exist."""
+    """Means (..., h, w) over window x window pixels; windows are cut off at the border."""
     if window == 1:
         return values
     flat = values.reshape(1, -1, *values.shape[-2:])
@@ -185,7 +183,7 @@ def _variance(values: Tensor, window: int) -> Tensor:
 
 
 def _census(reference: Tensor, warped: Tensor, window: int) -> Tensor:
-    """Twice the fraction of differing bits "darker than the centre" among the pixels that exist."""
+    """Twice the fraction of differing bits "darker than the centre"; patches are cut off at the border."""
     radius = window // 2
     height, width = reference.shape
     differing, count = torch.zeros_like(warped), torch.zeros_like(reference)
@@ -205,23 +203,23 @@ def _census(reference: Tensor, warped: Tensor, window: int) -> Tensor:
 def aggregate_views(
     costs: Tensor, visible: Tensor, *, best: int | None = None, min_views: int = 1
 ) -> tuple[Tensor, Tensor]:
-    """One cost a site: the mean over the neighbours that match best among those that see it.
+    """One cost per site: the mean over the best matches among the neighbours that see it.
 
-    What a neighbour sees of a point is often hidden by something in front; taking only the better half leaves it out
-    (Kang, Szeliski and Chai, "Handling occlusions in dense multi-view stereo", CVPR 2001, section 4.1).
+    A point is often occluded in some neighbours; the mean over the better half leaves these out (Kang, Szeliski and
+    Chai, "Handling occlusions in dense multi-view stereo", CVPR 2001, section 4.1).
 
     Args:
         costs: (V-1, P, h, w), see `matching_costs`.
         visible: (V-1, P, h, w) bool.
-        best: how many neighbours are averaged, fewer where fewer see a site; by default half of them, rounded up.
-        min_views: least number of neighbours that must see a site.
+        best: the number of neighbours that are averaged, fewer where fewer see a site; by default half, rounded up.
+        min_views: the least number of neighbours that must see a site.
 
     Returns:
-        Costs (P, h, w), `INVALID_COST` where fewer than `min_views` neighbours see a site, and how many do, (P, h, w).
-        Differentiable in `costs`.
+        Costs (P, h, w), `INVALID_COST` where fewer than `min_views` neighbours see a site, and the number that do,
+        (P, h, w). Differentiable in `costs`.
 
     Raises:
-        OptionError: `best` or `min_views` is no number from 1 to that of the neighbours.
+        OptionError: `best` or `min_views` is not a whole number from 1 to the number of neighbours.
         ShapeError, DTypeError: costs or visible of another shape or dtype.
 
     Example:

@@ -1,4 +1,4 @@
-"""Plane-sweep stereo: a cost for every plane of a view's frustum, and the winner along every ray."""
+"""Plane-sweep stereo: a cost for every plane of the frustum of a view, and the winner along every ray."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from lsmgeo.errors import OptionError
 
 __all__ = ["DepthMap", "kept", "run_sweep", "slab_planes", "sweep"]
 
-# Minima nearer to each other are one place: a cost varies no faster than the image.
+# Minima that are closer are one: a cost varies no faster than the image.
 SAME_PIXELS = 2.0
 # More planes at once are not faster.
 MOST_PLANES = 8
-# How many arrays of each kind are alive at once at the worst moment (measured), and what the libraries take besides.
+# The largest number of arrays of each kind in memory at one time (measured), and the memory of the libraries.
 LIVE_COSTS = 8
 LIVE_IMAGES = 24
 OVERHEAD = 48 << 20
 
 
 class DepthMap(NamedTuple):
-    """Depth of every pixel of a view and how far it can be trusted."""
+    """Depth of every pixel of a view, and its confidence."""
 
     depth: Tensor  # (h, w) camera z, world units, 0 where no plane wins
     confidence: Tensor  # (h, w) in [0, 1]
@@ -42,11 +42,11 @@ class DepthMap(NamedTuple):
 
 
 def slab_planes(neighbours: int, channels: int, size: tuple[int, int], memory: int) -> int:
-    """Planes that a slab may have within a memory bound.
+    """The number of planes of a slab within a memory bound.
 
     Args:
         neighbours: V - 1.
-        channels: C of what is warped, in numbers of 4 bytes.
+        channels: C of the warped images, in numbers of 4 bytes.
         size: (h, w) of the maps.
         memory: bytes that the sweep may add to the process.
 
@@ -54,8 +54,8 @@ def slab_planes(neighbours: int, channels: int, size: tuple[int, int], memory: i
         OptionError: not even one plane fits.
     """
     image = 4 * size[0] * size[1]
-    rooms = torch.get_num_threads() * (neighbours + 4)
-    fixed = OVERHEAD + ((neighbours + 1) * (channels + 1) + rooms + LIVE_IMAGES) * image
+    buffers = torch.get_num_threads() * (neighbours + 4)
+    fixed = OVERHEAD + ((neighbours + 1) * (channels + 1) + buffers + LIVE_IMAGES) * image
     plane = (3 * channels + LIVE_COSTS) * neighbours * image
     if memory < fixed + plane:
         need = -(-(fixed + plane) // 2**20)
@@ -82,31 +82,31 @@ def sweep(
 ) -> DepthMap:
     """Depth of the first view by sweeping planes through its frustum.
 
-    At every site the `best` matching of the neighbours that see it are averaged (see
-    `lsmgeo.classical.matching_costs` and `lsmgeo.classical.aggregate_views`). Along a ray the lowest local minimum
-    wins, and a parabola through it and its neighbours in inverse depth places it between planes. Planes pass in slabs
-    and only the running winners are kept. (Collins, "A space-sweep approach to true multi-image matching", CVPR 1996.)
+    At every site the costs of the `best` neighbours that see it are averaged (see `lsmgeo.classical.matching_costs`
+    and `lsmgeo.classical.aggregate_views`). Along a ray the lowest local minimum wins, and a parabola through it and
+    its neighbours in inverse depth places it between planes. Planes are processed in slabs, and only the running
+    winners are kept. (Collins, "A space-sweep approach to true multi-image matching", CVPR 1996.)
 
     Convention:
         Depth is camera z of the first view. Integer pixel centres.
 
     Args:
         images: (V, C, h, w), the reference first, V at least 2: RGB or grey in [0, 1], or features.
-        cameras: leading shape (V,), of images resized to (h, w) or of the originals, which may differ in size.
+        cameras: leading shape (V,), of images of any sizes; they are resized to (h, w).
         depths: (P,) ascending, P >= 3; see `lsmgeo.classical.sweep_planes`.
         score: "zncc", "sad", "census" or "cosine".
         window: side of the patches, odd.
         best: neighbours averaged at a site, by default half of them, rounded up.
         min_views: least number of neighbours that must see a site, the reference not included.
-        cost_filter: takes costs (d, h, w) float32 of some planes and gives filtered ones, plane by plane.
-        noise: standard deviation of the images' values that counts as no texture.
-        memory: bound in bytes on what the sweep adds to the process, from which the size of a slab follows.
+        cost_filter: maps costs (d, h, w) float32 of some planes to filtered ones, plane by plane.
+        noise: standard deviation of the images below which texture has little weight.
+        memory: bound in bytes on the memory that the sweep adds to the process; it sets the size of a slab.
         progress: whether to show a progress bar (on a terminal).
 
     Returns:
-        `DepthMap` at (h, w). The confidence is ``max(0, 1 - cost)`` times the root of the uniqueness (how far the
-        second-lowest minimum elsewhere is above the lowest) times the fraction of near pixels that lie at the
-        same place, within two pixels of the neighbour where samples move most.
+        `DepthMap` at (h, w). The confidence is ``max(0, 1 - cost)`` times the square root of the uniqueness (by how
+        much the second-lowest minimum at another depth is above the lowest) times the fraction of nearby pixels at the
+        same depth, within two pixels in the neighbour in which samples move most.
 
     Raises:
         OptionError: too few planes or views, or a memory bound too small for one plane.
@@ -129,7 +129,7 @@ def run_sweep(
     cost_filter: Callable[[Tensor], Tensor] | None = None,
     progress: bool = False,
 ) -> DepthMap:
-    """`sweep` with options that have been checked."""
+    """`sweep` with checked options."""
     views, channels, height, width = images.shape
     warped = (channels if options.score in ("sad", "cosine") else 1) * max(1, images.element_size() // 4)
     slab = slab_planes(max(views - 1, 1), warped, (height, width), options.memory)
@@ -148,7 +148,7 @@ def run_sweep(
 
 
 def _planes_apart(cameras: Cameras, depths: Tensor, size: tuple[int, int]) -> float:
-    """Planes in which a sample moves `SAME_PIXELS` on the average, in the neighbour where it moves most."""
+    """The planes over which a sample moves `SAME_PIXELS` on average, in the neighbour where it moves most."""
     path = longest_path(resize(cameras, *size), float(depths[0]), float(depths[-1]))
     return SAME_PIXELS * (len(depths) - 1) / max(path, 1e-6)
 
@@ -158,15 +158,15 @@ def kept(depth_map: DepthMap, density: float, least: float = 0.0, specks: int = 
 
     Args:
         depth_map: from `sweep`.
-        density: largest fraction of all pixels to keep, in (0, 1]; among equals the first, row by row, are kept.
+        density: largest fraction of all pixels to keep, in (0, 1]; of equal pixels the first, row by row, are kept.
         least: confidence below which a pixel is never kept.
-        specks: drop connected patches of kept pixels, without a jump in depth, that have fewer pixels than this.
+        specks: connected patches of kept pixels, without a jump in depth, with fewer pixels than this are dropped.
 
     Returns:
         (h, w) bool.
 
     Raises:
-        OptionError: a density outside (0, 1], or specks that are no whole number.
+        OptionError: a density outside (0, 1], or specks that are not a whole number.
 
     Example:
         >>> import torch
@@ -181,9 +181,9 @@ def kept(depth_map: DepthMap, density: float, least: float = 0.0, specks: int = 
     check_number("kept", "least", least, "a number")
     check_whole("kept", "specks", specks, 0, 2**31 - 1)
     confidence = torch.where(depth_map.depth > 0, depth_map.confidence, 0.0)
-    # The margin keeps a product that is whole but for rounding: 0.29 * 100 is 28.999999999999996.
+    # The margin is for products that are whole but for rounding: 0.29 * 100 is 28.999999999999996.
     number = math.floor(density * confidence.numel() + 1e-6)
-    # A stable order, unlike topk's, is the same on every machine where confidences are equal.
+    # A stable order, unlike that of topk, is the same on every machine if confidences are equal.
     best = confidence.flatten().sort(descending=True, stable=True).indices[:number]
     mask = torch.zeros_like(confidence, dtype=torch.bool)
     mask.view(-1)[best] = True
@@ -195,14 +195,14 @@ def _without_specks(mask: Tensor, planes: Tensor, least: int) -> Tensor:
     """A mask without its connected patches of fewer than `least` pixels; a jump of two planes separates patches."""
     import cv2
 
-    steps = 8  # filterSpeckles wants 16-bit integers: eighths of a plane
+    steps = 8  # filterSpeckles needs 16-bit integers: eighths of a plane
     labels = torch.where(mask, (planes.clamp(0, 4000) + 1) * steps, 0.0).to(torch.int16).numpy()
     cv2.filterSpeckles(labels, 0, least - 1, 2 * steps)
     return mask & torch.from_numpy(labels > 0)
 
 
 def _agreement(place: Tensor, apart: float, radius: int = 2) -> Tensor:
-    """The fraction of the pixels around each whose winner is at most so many planes apart from its own, (h, w)."""
+    """The fraction of the pixels around each whose winner is at most ``apart`` planes from its own, (h, w)."""
     height, width = place.shape
     side = 2 * radius + 1
     around = pad(place[None], (radius,) * 4, value=-1e6)[0]

@@ -17,19 +17,19 @@ __all__ = ["longest_path", "sweep_planes"]
 
 MOST_PLANES = 1 << 20
 SPACINGS = ("inverse", "depth", "disparity")
-# Pixels of a path that passes behind a neighbour.
+# The length in pixels of a path that passes behind a neighbour.
 ENDLESS = 1e9
 
 
 def sweep_planes(cameras: Cameras, near: float, far: float, num: int = 300, spacing: str = "inverse") -> Tensor:
-    """Depths of the planes of a sweep from near to far, both included.
+    """The depths of the planes of a sweep, from near to far, both included.
 
-    "inverse" makes even steps in the neighbours' images where they are beside the reference, "depth" even steps in the
-    world. "disparity" is "inverse" with as many planes as make a step of a pixel or less in the neighbour whose sample
-    of the reference's centre moves most.
+    "inverse" makes even steps in the images of neighbours beside the reference, "depth" even steps in the world.
+    "disparity" is "inverse" with the number of planes that makes a step of at most a pixel in the neighbour in which
+    the centre of the reference moves most.
 
     Args:
-        cameras: leading shape (V,), the reference first, at the size at which they are matched; only "disparity" looks.
+        cameras: leading shape (V,), the reference first, at the size at which they are matched; used by "disparity".
         near: first depth, positive, world units.
         far: last depth, larger.
         num: number of planes, at least 3; not used by "disparity".
@@ -39,7 +39,7 @@ def sweep_planes(cameras: Cameras, near: float, far: float, num: int = 300, spac
         (P,) float64, ascending.
 
     Raises:
-        OptionError: an unknown spacing, a range that is no two finite numbers, more than 2^20 steps of a pixel.
+        OptionError: an unknown spacing, a range that is not finite, more than 2^20 steps of a pixel.
         GridError: near and far not positive and ascending.
 
     Example:
@@ -64,7 +64,7 @@ def sweep_planes(cameras: Cameras, near: float, far: float, num: int = 300, spac
 
 
 def longest_path(cameras: Cameras, near: float, far: float) -> float:
-    """Pixels that the sample of the reference's centre moves from near to far in the neighbour that moves it most.
+    """Pixels that the centre of the reference moves from near to far, in the neighbour in which it moves most.
 
     Args:
         cameras: leading shape (V,), the reference first.
@@ -72,9 +72,9 @@ def longest_path(cameras: Cameras, near: float, far: float) -> float:
         far: last depth.
     """
     tensors = as_tensors(cameras, "longest_path")
-    if tensors.cam_from_world.dim() != 3 or len(tensors.cam_from_world) < 2:
+    if len(tensors.shape) != 1 or tensors.shape[0] < 2:
         raise ShapeError(f"longest_path: cameras must have leading shape (V,), V at least 2; got {tensors.shape}")
-    # The only pixel of a map of one is at the centre of the image.
+    # The pixel of a map of one pixel is at the centre of the image.
     depth = torch.tensor([near, far], dtype=torch.float64).reshape(1, 2, 1, 1)
     ends = unproject_depth(tensors.at([0, 0]), depth).reshape(1, 2, 3)
     pixels, z, _ = project(tensors.at(slice(1, None)), ends, near=1e-6 * near)

@@ -1,4 +1,4 @@
-"""Outlines of the object in photographs: from alpha, from files beside them, or by the colour of the background."""
+"""Silhouettes of the object in images: from alpha, from mask files, or by the colour of the background."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from lsmgeo.errors import DataError, OptionError, ShapeError
 
 __all__ = ["mask_folder", "signed_distance", "silhouettes"]
 
-# Folders of outlines that are found beside photographs, or beside their folder.
+# Folders of masks that are found beside the images, or beside their folder.
 FOLDERS = ("masks", "mask", "silhouettes", "derived_silhouettes")
 ENDINGS = (".png", ".jpg", ".jpeg")
 COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-# By the background rule, channels may differ by so much, and pieces and holes of so few of the pixels are noise.
+# Of the background: the largest difference of a channel; components below this fraction of the pixels are noise.
 TOLERANCE, SPECK_FRACTION = 0.1, 5e-4
 
 
@@ -32,29 +32,29 @@ def silhouettes(
     folder: str | os.PathLike[str] | None = None,
     background: str | Sequence[float] | None = None,
 ) -> list[Tensor]:
-    """Which pixels of posed photographs show the object.
+    """The pixels of posed images that show the object.
 
-    The first that applies: the files of a ``folder``; the rule of a ``background``; the photographs' own alpha, where
-    they are cut out; a folder named masks, mask, silhouettes or derived_silhouettes beside the photographs or beside
-    the folder that they lie in.
+    The first of these that applies: the files of a ``folder``; the colour of the ``background``; the alpha of the
+    images, if they are cut out; a folder named masks, mask, silhouettes or derived_silhouettes beside the images or
+    beside their folder.
 
-    A file of a folder has its photograph's name (the ending may differ, and ``name.png.png`` is taken too) and size; a
-    pixel belongs to the object where it is brighter than half, and opaque. By the rule, a pixel belongs to the object
-    where a channel differs from the background's colour by more than 0.1; then pieces and holes smaller than
-    0.05 % of the picture are flipped. What the object shares with the background's colour is lost by it.
+    A mask file has the name (the ending may differ, and ``name.png.png`` is accepted) and the size of its image; a
+    pixel is on the object if it is brighter than half, and opaque. By colour, a pixel is on the object if a channel
+    differs from the background by more than 0.1; then components and holes smaller than 0.05 % of the image are
+    removed. Parts of the object in the colour of the background are lost.
 
     Args:
-        scene: posed photographs.
-        views: which; all by default.
+        scene: posed images.
+        views: indices; all by default.
         folder: of mask files.
         background: "black", "white" or (r, g, b) in [0, 1].
 
     Returns:
-        (H, W) bool for every view, straightened as the photographs are.
+        (H, W) bool for every view, undistorted as the images are.
 
     Raises:
-        OptionError: no outlines are there and no background is named; a view that does not exist; both rules at once.
-        DataError: a mask or a photograph is missing, damaged or not of its camera's size.
+        OptionError: no silhouettes and no background; a view that does not exist; both a folder and a background.
+        DataError: a mask or an image is missing, damaged or not of the size of its camera.
     """
     who = "silhouettes"
     chosen = range(len(scene)) if views is None else views
@@ -72,14 +72,14 @@ def silhouettes(
     found = mask_folder(scene) if folder is None else Path(folder)
     if found is None:
         raise OptionError(
-            f"{who}: the photographs have no alpha, and beside them lies no folder named {', '.join(FOLDERS)}; "
-            "name a folder of masks, or the background's colour"
+            f"{who}: the images have no alpha, and there is no folder named {', '.join(FOLDERS)} beside them; "
+            "give a folder of masks, or the colour of the background"
         )
     return [_from_file(scene, view, found) for view in chosen]
 
 
 def mask_folder(scene: PosedImages) -> Path | None:
-    """The folder of outlines beside a scene's photographs, or beside the folder that they lie in; None without."""
+    """The folder of masks beside the images of a scene, or beside their folder; None without."""
     beside = scene.paths[0].parent
     for place in (beside, beside.parent):
         for name in FOLDERS:
@@ -90,17 +90,17 @@ def mask_folder(scene: PosedImages) -> Path | None:
 
 
 def signed_distance(mask: Tensor) -> Tensor:
-    """Distance of every pixel to the outline, in pixels, positive on the object.
+    """Distance of every pixel to the contour of a silhouette, in pixels, positive on the object.
 
-    Between the centres of a pixel on the object and its neighbour off it, the interpolated distance crosses 0 halfway.
-    A `lsmgeo.classical.visual_hull` of distances, by the rule "all" at threshold 0, has a field from which
+    The interpolated distance is 0 halfway between the centres of a pixel on the object and a neighbour off it. From the
+    support of a `lsmgeo.classical.visual_hull` of distances, with rule "all" and threshold 0,
     `lsmgeo.classical.extract_mesh` makes a smooth surface.
 
     Args:
         mask: (h, w) bool.
 
     Returns:
-        (h, w) float32; where the mask is all one, the picture's diagonal.
+        (h, w) float32; if the mask is constant, plus or minus the diagonal of the image.
 
     Example:
         >>> import torch
@@ -150,8 +150,8 @@ def _without_specks(mask: np.ndarray, least: float) -> np.ndarray:
     return np.asarray(large[label])
 
 
-def _file_of(photograph: Path, folder: Path) -> Path | None:
-    names = [photograph.stem + ending for ending in ENDINGS] + [photograph.name + ".png"]
+def _file_of(image: Path, folder: Path) -> Path | None:
+    names = [image.stem + ending for ending in ENDINGS] + [image.name + ".png"]
     return next((folder / name for name in names if (folder / name).is_file()), None)
 
 

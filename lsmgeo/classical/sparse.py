@@ -1,4 +1,4 @@
-"""How far a depth map is from a scene's own sparse points."""
+"""The error of a depth map at the sparse points of its scene."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["SparseError", "sparse_error"]
 
 @dataclass(frozen=True)
 class SparseError:
-    """Relative depth error at a scene's own sparse points."""
+    """Relative depth error at the sparse points of a scene."""
 
     median: float
     points: int
@@ -29,11 +29,11 @@ def sparse_error(scene: PosedImages, view: int, depth_map: DepthMap, mask: Tenso
     Args:
         scene: with or without sparse points.
         view: the view of the depth map.
-        depth_map: its depths, of any size.
-        mask: (h, w) bool, the pixels that count.
+        depth_map: of any size.
+        mask: (h, w) bool, the pixels to use.
 
     Returns:
-        The median of ``|depth - true| / true``, and how many points count of how many observed; None without points.
+        The median of ``|depth - true| / true``, the number of points used, and of those observed; None without points.
     """
     if scene.points is None:
         return None

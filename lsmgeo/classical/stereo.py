@@ -1,4 +1,4 @@
-"""From posed photographs to the depth map and the coloured points of one view."""
+"""Plane-sweep stereo of posed images: depth maps, coloured points and a mesh of one view or of several."""
 
 from __future__ import annotations
 
@@ -38,36 +38,35 @@ __all__ = [
     "reconstruct_views",
 ]
 
-# Confidence below which a pixel is never shown, however few there are: dark or plain surfaces give some depth, too.
-# What another view agrees with needs less.
+# The least confidence of a pixel to keep, as dark and uniform surfaces get some depth too; less if another view agrees.
 LEAST_CONFIDENCE, LEAST_CONFIDENCE_AGREED = 0.35, 0.1
 SPECK_FRACTION = 5e-4
 # The default density of several views.
 SCENE_DENSITY = 0.8
 SPECK_FACES = 100
-# Longer side in pixels of the sweep that looks for a depth range.
+# Longer side in pixels of the sweep that finds a depth range.
 COARSE_SIZE = 160
-# With so many other depth maps, the nearest views', a depth map is compared at most.
+# The largest number of other depth maps that one is compared with: those of the nearest views.
 MOST_CHECKED = 12
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """What one view's sweep gives.
+    """The result of the sweep of one view.
 
     Attributes:
         view: index of the reference.
-        neighbours: the views it was matched with.
+        neighbours: the views that it was matched with.
         depths: (P,) planes, ascending, world units.
-        image: (3, h, w) the reference at the depth map's size.
+        image: (3, h, w) the reference at the size of the depth map.
         camera: its camera at that size.
-        depth_map: depth and confidence of every pixel; where other views were asked, any pixel that more of them
-            agree with, up to two, is trusted before all with fewer.
+        depth_map: depth and confidence of every pixel; if other views were swept, a pixel on which more of them agree,
+            up to two, has a higher confidence than all with fewer.
         mask: (h, w) bool, the pixels kept.
         points: (N, 3) float32 world positions of the kept pixels.
         colours: (N, 3) uint8.
-        error: against the scene's sparse points, where it has any, among the best pixels of the wanted density.
-        support: (h, w) int64, how many other swept views agree; None where none were asked.
+        error: at the sparse points of the scene, if it has any, among the best pixels of the wanted density.
+        support: (h, w) int64, the number of other swept views that agree; None if no others were swept.
     """
 
     view: int
@@ -85,13 +84,13 @@ class Reconstruction:
 
 @dataclass(frozen=True, eq=False)
 class SceneReconstruction:
-    """What the sweeps of several views give together.
+    """The result of the sweeps of several views.
 
     Attributes:
-        views: one reconstruction a view, with the pixels kept that other views agree with.
-        points: (N, 3) float32 world positions of all pixels kept.
+        views: one reconstruction per view, with the pixels kept on which other views agree.
+        points: (N, 3) float32 world positions of all kept pixels.
         colours: (N, 3) uint8.
-        mesh: their surface; None where none was asked for, or no pixel was kept.
+        mesh: their surface; None if it was not wanted, or no pixel was kept.
     """
 
     views: tuple[Reconstruction, ...]
@@ -101,20 +100,20 @@ class SceneReconstruction:
 
 
 def reconstruct_view(scene: PosedImages, view: int, *, density: float = 0.4, **options: Any) -> Reconstruction:
-    """Reconstruct what one photograph sees, by plane-sweep stereo with its best neighbours.
+    """Reconstruct one view by plane-sweep stereo with its best neighbours.
 
     Args:
-        scene: posed photographs, see `lsmgeo.data.open`; two are enough.
+        scene: posed images, see `lsmgeo.data.open`; two are enough.
         view: index of the reference.
         density: largest fraction of the pixels to keep.
-        options: of `reconstruct_scene`, for sweeps.
+        options: of the sweep, see `reconstruct_scene`.
 
     Returns:
-        `Reconstruction`; its mask is empty where nothing can be trusted, as in photographs without texture.
+        `Reconstruction`; its mask is empty if no pixel is confident, as in images without texture.
 
     Raises:
-        OptionError: an option out of range, or no range or neighbours can be told.
-        DataError: a photograph cannot be read.
+        OptionError: an option out of range, or no range or neighbours can be found.
+        DataError: an image cannot be read.
     """
     return reconstruct_scene(scene, [view], mesh=False, density=density, **options).views[0]
 
@@ -139,36 +138,36 @@ def reconstruct_scene(
     memory: int = 1 << 30,
     progress: bool = False,
 ) -> SceneReconstruction:
-    """Reconstruct what several photographs see: depth maps that agree with each other, their points and their surface.
+    """Reconstruct several views: depth maps that agree with each other, their points and their surface.
 
-    Every view is swept; of its best pixels those are kept with which enough of the other views agree
+    Every view is swept; of its best pixels those are kept on which enough of the other views agree
     (`lsmgeo.classical.consistent_views`), and the depth maps are fused (`lsmgeo.classical.fuse_depth`).
 
     Args:
-        scene: posed photographs, see `lsmgeo.data.open`; two are enough.
+        scene: posed images, see `lsmgeo.data.open`; two are enough.
         views: the views to sweep; by default all. Each is matched with its best neighbours, swept or not.
-        neighbours: how many other views to match with, at most.
-        size: longer side of the depth maps in pixels; never larger than the photographs.
+        neighbours: the largest number of other views to match with.
+        size: longer side of the depth maps in pixels; never larger than the images.
         planes: number of depth planes; see `lsmgeo.classical.sweep_planes`.
-        spacing: "inverse", "depth" or "disparity" (then their number follows).
-        near: nearest depth, world units; by default told for every view, see `lsmgeo.classical.find_depth_range`.
+        spacing: "inverse", "depth" or "disparity" (which sets their number).
+        near: nearest depth, world units; by default found for every view, see `lsmgeo.classical.find_depth_range`.
         far: farthest depth.
         score: "zncc", "sad" or "census", see `lsmgeo.classical.matching_costs`.
         window: side of the patches in pixels, odd.
-        filtered: whether costs are averaged along the edges of the photograph, see `lsmgeo.classical.guided_filter`.
-        density: largest fraction of the pixels to keep, which must find agreement besides.
-        min_support: least number of other swept views that must agree; by default 1, where others are swept.
+        filtered: whether to filter the costs with `lsmgeo.classical.guided_filter`.
+        density: largest fraction of the pixels to keep.
+        min_support: least number of other swept views that must agree; by default 1 if others are swept.
         mesh: whether to make the surface.
         resolution: voxels along the longest side of the box in which the surface is made.
-        memory: bound in bytes on what one sweep adds to the process; depth maps and pictures of all views are kept.
-        progress: whether to show a progress bar, one step a view, or a plane of a single view.
+        memory: bound in bytes on what one sweep adds to the process; depth maps and images of all views are kept.
+        progress: whether to show a progress bar, with one step per view, or per plane of a single view.
 
     Returns:
         `SceneReconstruction`.
 
     Raises:
-        OptionError: an option out of range, or no range or neighbours can be told.
-        DataError: a photograph cannot be read.
+        OptionError: an option out of range, or no range or neighbours can be found.
+        DataError: an image cannot be read.
     """
     options = SweepOptions(
         neighbours=neighbours,
@@ -199,7 +198,7 @@ def reconstruct_views(
     resolution: int = 192,
     progress: bool = False,
 ) -> SceneReconstruction:
-    """`reconstruct_scene` with options that have been checked."""
+    """`reconstruct_scene` with checked options."""
     chosen = list(range(len(scene))) if views is None else list(views)
     if not chosen or len(set(chosen)) != len(chosen):
         raise OptionError(f"views must name at least one view, none twice; got {views}")
@@ -224,7 +223,7 @@ def reconstruct_views(
 
 
 class _SweptView(NamedTuple):
-    """The first fields of a `Reconstruction`, which are known before other views are asked."""
+    """The first fields of a `Reconstruction`, which do not depend on the results of other views."""
 
     view: int
     neighbours: tuple[int, ...]
@@ -260,7 +259,7 @@ def _depth_range(scene: PosedImages, view: int, options: SweepOptions) -> tuple[
 def _keep(
     scene: PosedImages, one: _SweptView, swept: Sequence[_SweptView], least: int, density: float
 ) -> Reconstruction:
-    """The best pixels of one view that at least so many of the others agree with."""
+    """The best pixels of one view on which at least ``least`` of the others agree."""
     depth_map, support = one.depth_map, None
     depth, allowed = depth_map.depth, depth_map.confidence > LEAST_CONFIDENCE
     away = (origins := centers(scene.cameras)) - origins[one.view]
@@ -269,7 +268,7 @@ def _keep(
         maps, cameras = [other.depth_map.depth for other in others], [other.camera for other in others]
         support = consistent_views(depth, one.camera, maps, cameras)
         allowed = (support >= least) & (depth_map.confidence > LEAST_CONFIDENCE_AGREED)
-        # Any pixel with more support comes before all with less; beyond two, more says nothing.
+        # A pixel with more support has a higher confidence than all with less, up to two.
         most = min(len(others), 2)
         confidence = (support.clamp_max(most) + depth_map.confidence) / (most + 1)
         depth_map = depth_map._replace(confidence=torch.where(depth > 0, confidence, 0.0))
@@ -282,14 +281,14 @@ def _keep(
 
 
 def surface_of(swept: Sequence[Reconstruction], points: np.ndarray, resolution: int) -> Mesh:
-    """The surface that the kept pixels of several views show, in a box around the middle 98 % of their points."""
+    """The surface of the kept pixels of several views, in a box around the middle 98 % of their points."""
     from lsmgeo.classical.surface import extract_mesh
     from lsmgeo.classical.tsdf import fuse_depth
     from lsmgeo.data.meshes import Mesh
 
     low, high = np.percentile(points.astype(np.float64), (1, 99), axis=0)
     margin = 0.1 * (high - low).max()
-    if not margin > 0:  # points at one place have no surface
+    if not margin > 0:  # points at one position have no surface
         return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
     low, high = low - margin, high + margin
     voxel = (high - low).max() / resolution

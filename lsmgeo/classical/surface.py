@@ -1,4 +1,4 @@
-"""Triangle meshes out of grids, and files of them."""
+"""Triangle meshes from grids, and their files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lsmgeo.grids import VoxelGrid
 __all__ = ["SurfaceMesh", "drop_specks", "extract_mesh", "write_mesh"]
 
 
-# The name that coloured surfaces had of their own.
+# The former name of coloured meshes.
 SurfaceMesh = Mesh
 
 
@@ -32,26 +32,26 @@ def extract_mesh(
 ) -> Mesh:
     """The surface of a signed distance, of an occupancy or of any field that is larger inside, by marching cubes.
 
-    (Lorensen and Cline, SIGGRAPH 1987; in Lewiner's form, which is topologically right, from scikit-image.)
+    (Lorensen and Cline, SIGGRAPH 1987; Lewiner's topologically correct variant, from scikit-image.)
 
     Convention:
-        Index i is the centre of voxel i. Of a `Tsdf`, cells are used of which all eight corners were seen, so that the
-        surface is open where nothing was seen; any other field is taken to be empty outside the grid, so that its
+        Index i is the centre of voxel i. In a `Tsdf`, only cells with eight observed corners are used, so that the
+        surface is open where nothing was observed; any other field is taken to be empty outside the grid, so that its
         surface is closed.
 
     Args:
         field: a `Tsdf`, or (D, H, W): bool, or numbers that are larger inside.
-        grid: where it lives.
-        level: the value on the surface: by default 0 for a `Tsdf`, 0.5 for others.
-        specks: pieces with fewer faces than this are dropped.
+        grid: of the field.
+        level: the value on the surface; by default 0 for a `Tsdf`, 0.5 for others.
+        specks: components with fewer faces than this are dropped.
 
     Returns:
-        The mesh; without faces where nothing crosses the level. Coloured where the `Tsdf` is.
+        The mesh, without faces if nothing crosses the level; with colours if the `Tsdf` has them.
 
     Raises:
         ShapeError, DTypeError: a field that does not fit the grid.
-        GridError: a grid with one pose a scene.
-        OptionError: a field that is not finite, a level that is no number, negative specks.
+        GridError: a grid with a batch of poses.
+        OptionError: a field that is not finite, a level that is not a number, negative specks.
 
     Example:
         >>> from lsmgeo import VoxelGrid, scenes
@@ -100,38 +100,28 @@ def extract_mesh(
 
 
 def drop_specks(mesh: Mesh, faces: int) -> Mesh:
-    """Drop the connected pieces that have fewer faces, and vertices that no face uses.
-
-    Args:
-        mesh: any.
-        faces: least number of faces of a piece that stays.
-
-    Returns:
-        What is left, perhaps nothing.
-    """
+    """Drop connected components with fewer than ``faces`` faces, and vertices that no face uses."""
     check_mesh("drop_specks", mesh, least=0)
     check_whole("drop_specks", "faces", faces, 0)
     if len(mesh.faces) == 0:
         return mesh
     ends = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    piece = components(len(mesh.vertices), ends[:, 0], ends[:, 1])
-    piece_of_face = piece[mesh.faces[:, 0]]
-    large = np.bincount(piece_of_face, minlength=piece.max() + 1) >= faces
-    return _without_unused(mesh, mesh.faces[large[piece_of_face]])
+    component = components(len(mesh.vertices), ends[:, 0], ends[:, 1])[mesh.faces[:, 0]]
+    return _without_unused(mesh, mesh.faces[(np.bincount(component) >= faces)[component]])
 
 
 def write_mesh(path: str | os.PathLike[str], mesh: Mesh) -> Path:
-    """Write a mesh as PLY or GLB, as the path's ending says, so that it is either wholly there or not at all.
+    """Write a mesh as PLY or GLB, according to the ending of the path; no incomplete file is left.
 
     Convention:
-        Coordinates are the mesh's own, also in GLB, whose viewers take y for up.
+        Coordinates are those of the mesh, also in GLB, in which viewers take y as up.
 
     Args:
         path: ends in .ply or .glb.
-        mesh: with one face at least.
+        mesh: with at least one face.
 
     Returns:
-        The path written.
+        The path.
 
     Raises:
         OptionError: another ending, or colours of faces.
@@ -154,7 +144,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh) -> Path:
 
 
 def _seen_cells(seen: np.ndarray) -> np.ndarray:
-    """Cells of which all corners are seen, named, as marching_cubes has it, by their last corner."""
+    """Cells with eight observed corners, at the index of their last corner, as `marching_cubes` expects."""
     cells = np.zeros_like(seen)
     corners = [
         seen[z : z - 1 or None, y : y - 1 or None, x : x - 1 or None] for z in (0, 1) for y in (0, 1) for x in (0, 1)
@@ -165,7 +155,7 @@ def _seen_cells(seen: np.ndarray) -> np.ndarray:
 
 
 def _march(inside: np.ndarray, cells: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (N, 3) as x, y, z index, float64, and faces (M, 3), where a field crosses 0."""
+    """Vertices (N, 3) as indices x, y, z, float64, and faces (M, 3), where a field crosses 0."""
     nothing = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     if min(inside.shape) < 2 or not inside.min() < 0 < inside.max():
         return nothing
@@ -176,13 +166,9 @@ def _march(inside: np.ndarray, cells: np.ndarray | None) -> tuple[np.ndarray, np
     except RuntimeError:  # no cell of the mask crosses the level
         return nothing
     mesh = Mesh(vertices[:, ::-1], faces)
-    mesh = _without_unused(mesh, _with_area(mesh))
-    return mesh.vertices, mesh.faces
-
-
-def _with_area(mesh: Mesh) -> np.ndarray:
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    return mesh.faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0]
+    mesh = _without_unused(mesh, mesh.faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0])
+    return mesh.vertices, mesh.faces
 
 
 def _without_unused(mesh: Mesh, faces: np.ndarray) -> Mesh:
@@ -192,7 +178,7 @@ def _without_unused(mesh: Mesh, faces: np.ndarray) -> Mesh:
 
 
 def _colours_at(colours: Tensor, index: np.ndarray) -> np.ndarray:
-    """Colours at fractional indices (N, 3), from the corners that have any: (N, 3) uint8."""
+    """Colours (N, 3) uint8 at fractional indices (N, 3), interpolated between the corners that have a colour."""
     from scipy.ndimage import map_coordinates
 
     values = colours.detach().cpu().double().numpy()

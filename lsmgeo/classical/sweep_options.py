@@ -1,4 +1,4 @@
-"""The options of plane sweeps: one value, checked once, below the keywords of the public functions."""
+"""The options of plane sweeps as one value that is checked once."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class SweepOptions:
         far: farthest depth; None to find it.
         score: see `lsmgeo.classical.matching_costs`.
         window: side of the patches in pixels, odd.
-        noise: standard deviation of the images' values that counts as no texture.
+        noise: standard deviation of the images below which texture has little weight.
         best: neighbours averaged at a site; None for half of them.
         min_views: least number of neighbours that must see a site.
         filtered: whether costs are averaged along the edges of the image.
         density: largest fraction of the pixels to keep; None for the default of the method.
-        memory: bound in bytes on what a sweep adds to the process; `slab_planes` checks it.
+        memory: bound in bytes on the memory that a sweep adds to the process; `slab_planes` checks it.
         who: the public function, for messages.
     """
 

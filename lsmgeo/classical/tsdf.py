@@ -1,4 +1,4 @@
-"""Depth maps of many views fused into one signed distance."""
+"""The fusion of depth maps of many views into one signed distance."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from lsmgeo.grids import VoxelGrid
 
 __all__ = ["Tsdf", "fuse_depth", "voxel_side"]
 
-# Voxels on each side of a surface that hear of it by default.
+# The default truncation in voxels.
 TRUNCATION = 3.0
-# Numbers alive for every voxel of a slab at the worst moment (measured).
+# The largest count of numbers in memory per voxel of a slab (measured).
 LIVE = 42
 
 
 class Tsdf(NamedTuple):
     """A truncated signed distance on a grid: positive outside, negative inside, 0 on the surface."""
 
-    distance: Tensor  # (D, H, W) world units, in [-truncation, truncation]; 0 where the weight is
-    weight: Tensor  # (D, H, W) sum of the weights of the views, 0 where none saw
+    distance: Tensor  # (D, H, W) world units, in [-truncation, truncation]; 0 where the weight is 0
+    weight: Tensor  # (D, H, W) sum of the weights of the views, 0 where nothing was observed
     colours: Tensor | None  # (3, D, H, W) RGB in [0, 1], 0 where no surface is near
 
 
@@ -44,39 +44,39 @@ def fuse_depth(
 ) -> Tsdf:
     """Fuse depth maps into one signed distance, view after view.
 
-    Equation: ``D(X) = sum_v w_v clip(d_v) / sum_v w_v``, where ``d_v`` is the distance along view v's ray from X on to
-    the surface that its depth map shows there: positive in front of it, clipped to the truncation; voxels further
-    behind than the truncation learn nothing. A view's weight is the cosine between its ray and the surface's normal,
-    times ``(1 + d / truncation)^2`` behind the surface, so that the two sides of a thin thing disturb each other
-    little. (Curless and Levoy, "A volumetric method for building complex models from range images", SIGGRAPH 1996,
-    sections 3 and 5.)
+    Equation: ``D(X) = sum_v w_v clip(d_v) / sum_v w_v``, where ``d_v`` is the distance along the ray of view v from X
+    to the surface of its depth map: positive in front of it, clipped to the truncation; voxels further behind than the
+    truncation are not updated. The weight of a view is the cosine between its ray and the surface normal, times
+    ``(1 + d / truncation)^2`` behind the surface, so that the two sides of a thin object interfere little.
+    (Curless and Levoy, "A volumetric method for building complex models from range images", SIGGRAPH 1996, sections 3
+    and 5.)
 
-    Between pixels inverse depth is interpolated, which is exact on planes; next to a bend by more than the truncation,
-    as at a jump, and next to pixels without depth, the nearest pixel's is taken. Cracks are closed first: a pixel
-    without depth between opposite neighbours whose depths differ by less than the truncation takes their mean.
+    Between pixels inverse depth is interpolated, which is exact on planes; where depth bends by more than the
+    truncation, as at a jump, and next to pixels without depth, that of the nearest pixel is used. Gaps of one pixel are
+    filled first: a pixel without depth takes the mean of opposite neighbours that differ by less than the truncation.
 
     Convention:
-        Depth is camera z, 0 where there is none: such pixels say nothing, unless they are `background`. Integer pixel
-        centres; a depth map of another size than the camera's image is resized for.
+        Depth is camera z, 0 where there is none: such pixels are not used, unless they are `background`. Integer pixel
+        centres; cameras are resized to the depth maps.
 
     Args:
         depths: (V, h, w), or any iterable of V maps (h, w) of any sizes, read one at a time; float32 or float64.
         cameras: V cameras.
-        grid: where to fuse; of one scene, any shape and pose.
-        truncation: world units; by default 3 times the longest side of a voxel. Noise of depth should stay below it,
-            and what is seen only at a grazing angle needs more: behind it, rays cross few voxels before the truncation.
-        colours: (V, 3, h, w) RGB in [0, 1], or an iterable of V, of the depth maps' sizes and dtype.
-        background: (V, h, w) bool, or an iterable of V: pixels of which it is known that their rays hit nothing. All
-            that they cross is outside. Their rim, one pixel wide, is left out.
-        memory: bound in bytes on what fusing holds beside the results and one view's maps.
+        grid: of the result; one scene, any shape and pose.
+        truncation: world units; by default 3 times the longest side of a voxel. It should be above the noise of depth,
+            and larger for surfaces that are seen only at grazing angles, behind which rays cross few voxels.
+        colours: (V, 3, h, w) RGB in [0, 1], or an iterable of V, of the sizes and dtype of the depth maps.
+        background: (V, h, w) bool, or an iterable of V: pixels whose rays hit nothing, so that all voxels on them are
+            outside. The outermost pixels of each region are not used.
+        memory: bound in bytes on the memory besides the results and the maps of one view.
 
     Returns:
-        `Tsdf` of the depths' dtype. Not differentiable.
+        `Tsdf` of the dtype of the depth maps. Not differentiable.
 
     Raises:
-        ShapeError, DTypeError: maps that are none, of other sizes than the depth maps, or not V of them.
-        OptionError: depths that are negative or not finite, colours that are not finite, no positive truncation.
-        GridError: a grid with one pose a scene.
+        ShapeError, DTypeError: invalid maps, of other sizes than the depth maps, or not V of them.
+        OptionError: depths that are negative or not finite, colours that are not finite, truncation not positive.
+        GridError: a grid with a batch of poses.
 
     Example:
         >>> import torch
@@ -89,22 +89,18 @@ def fuse_depth(
         tensor([-0.3760, -0.1254,  0.1256,  0.3772])
     """
     who = "fuse_depth"
-    _check_grid(who, grid)
+    if not isinstance(grid, VoxelGrid):
+        raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
+    if grid.world_from_lattice.dim() != 2:
+        raise GridError(f"{who}: grid must be of one scene; got {grid}")
     tensors = as_tensors(cameras, who)
-    if tensors.intrinsics.dim() != 3 or not len(tensors.intrinsics):
+    if len(tensors.shape) != 1 or not tensors.shape[0]:
         raise ShapeError(f"{who}: cameras must have the leading shape (V,), V at least 1; got {tensors.shape}")
-    views = len(tensors.intrinsics)
     truncation = TRUNCATION * voxel_side(grid) if truncation is None else truncation
     check_positive(who, "truncation", truncation)
     check_whole(who, "memory", memory, 1)
-    columns = [
-        _each(who, name, value, views)
-        for name, value in (
-            ("depths", depths),
-            ("colours", colours),
-            ("background", background),
-        )
-    ]
+    named = {"depths": depths, "colours": colours, "background": background}
+    columns = [_each(who, name, value, tensors.shape[0]) for name, value in named.items()]
     sums: _Sums | None = None
     with torch.no_grad():
         for view, given in enumerate(zip(*columns, strict=True)):
@@ -114,17 +110,17 @@ def fuse_depth(
             elif maps.depth.dtype != sums.distance.dtype:
                 raise DTypeError(f"{who}: depths must be of one dtype; got {sums.distance.dtype}, {maps.depth.dtype}")
             _fuse_view(sums, maps, tensors.at(view), grid, truncation, memory)
-    assert sums is not None  # cameras are at least one
+    assert sums is not None  # V is at least 1
     return sums.finish()
 
 
 def voxel_side(grid: VoxelGrid) -> float:
-    """The longest side of a grid's voxels, world units."""
+    """The longest side of the voxels of a grid, world units."""
     return float(grid.world_from_lattice[..., :3, :3].norm(dim=-2).max())
 
 
 class _Maps(NamedTuple):
-    """What is known of one view's pixels, (h, w) each, colours (3, h, w)."""
+    """The maps of one view: (h, w) each, colours (3, h, w)."""
 
     depth: Tensor
     colours: Tensor | None
@@ -156,7 +152,7 @@ def _fuse_view(
     height, width = maps.depth.shape
     camera = resize(camera, height, width)
     smooth, nearest = _feature_maps(maps, camera, truncation)
-    planes = _slab_planes(grid, smooth, memory)
+    planes = max(1, memory // (LIVE * smooth.element_size() * grid.shape[1] * grid.shape[2]))  # type: ignore[index]
     views, augment = camera.at(None), ("depth", "direction")
     interpolated = functional.unproject_slabs(
         smooth, views, grid, planes, padding_mode="border", augment=augment, direction_frame="camera"
@@ -166,12 +162,12 @@ def _fuse_view(
     for (_, between, visible), (_, exact, _) in zip(interpolated, taken, strict=True):
         count = visible.numel()
         seen = visible.flatten() & (exact[0, 0, 1] > 0).flatten()
-        at = seen.nonzero()[:, 0]  # of most views most voxels learn nothing
+        at = seen.nonzero()[:, 0]  # most views update few voxels
         inverse, roughness, z, along = (between[0, 0, row].flatten().index_select(0, at) for row in (0, 1, 2, 5))
         pixel, weight = (row.flatten().index_select(0, at) for row in exact[0, 0])
         is_rough = roughness > 0
         inverse = torch.where(is_rough, pixel, inverse)
-        # Where a ray hits nothing, inverse depth is 0 and the surface infinitely far.
+        # Where a ray hits nothing, inverse depth is 0 and the distance infinite.
         distance = (1 / inverse - z) / along
         near = distance > -truncation
         at, distance, weight = at[near] + first, distance[near], weight[near]
@@ -188,7 +184,7 @@ def _fuse_view(
 def _add_colours(
     sums: _Sums, colours: Tensor, views: CameraTensors, grid: VoxelGrid, at: Tensor, share: Tensor, is_rough: Tensor
 ) -> None:
-    """Add what a view's picture shows at voxels ``at``, counted through the grid, times their shares of it."""
+    """Add the colours of an image at the voxels with flat indices ``at``, times their weights ``share``."""
     assert sums.colours is not None
     assert sums.near is not None
     _, height, width = grid.shape  # type: ignore[misc]
@@ -204,13 +200,13 @@ def _add_colours(
 
 
 def _feature_maps(maps: _Maps, camera: CameraTensors, truncation: float) -> tuple[Tensor, Tensor]:
-    """What is interpolated: inverse depth and roughness; and what is not: inverse depth and weight, 0 if unknown."""
+    """The maps to interpolate: inverse depth and roughness; and not to: inverse depth and weight, 0 if unknown."""
     depth = maps.depth
     has_depth = depth > 0
     inverse = _without_cracks(torch.where(has_depth, 1 / torch.where(has_depth, depth, 1), 0), truncation)
     inner = None
     if maps.background is not None:
-        # The largest of the negative is the least: a rim of one pixel is no background.
+        # A minimum filter: the outermost pixels are left out.
         inner = -max_pool2d(-maps.background[None, None].to(depth.dtype), 3, 1, 1)[0, 0] > 0
         inverse = torch.where(inner, 0, inverse)
     rough, weight = _is_rough(inverse, truncation), _cosine(inverse, camera)
@@ -222,14 +218,14 @@ def _feature_maps(maps: _Maps, camera: CameraTensors, truncation: float) -> tupl
 
 
 def _without_cracks(inverse: Tensor, truncation: float) -> Tensor:
-    """Inverse depth (h, w) in which a pixel that has none takes the mean of opposite neighbours that agree."""
+    """Inverse depth (h, w) in which a pixel without any takes the mean of opposite neighbours that agree."""
     height, width = inverse.shape
     wide = pad(inverse, (1, 1, 1, 1))
     total, count = torch.zeros_like(inverse), torch.zeros_like(inverse)
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
         first = wide[1 + down : 1 + down + height, 1 + right : 1 + right + width]
         second = wide[1 - down : 1 - down + height, 1 - right : 1 - right + width]
-        # |1 / first - 1 / second| < truncation; false where one has no depth.
+        # |1 / first - 1 / second| < truncation; false if one has no depth.
         agrees = (first - second).abs() < truncation * first * second
         total += torch.where(agrees, (first + second) / 2, 0)
         count += agrees
@@ -237,7 +233,7 @@ def _without_cracks(inverse: Tensor, truncation: float) -> Tensor:
 
 
 def _is_rough(inverse: Tensor, truncation: float) -> Tensor:
-    """Whether depth bends by more than the truncation at a pixel, or a neighbour has none, (h, w) bool.
+    """Whether depth bends by more than the truncation at a pixel, or a neighbour has no depth, (h, w) bool.
 
     Second differences of inverse depth are 0 on every plane, however steep, and large on both sides of a jump.
     """
@@ -251,7 +247,7 @@ def _is_rough(inverse: Tensor, truncation: float) -> Tensor:
 def _cosine(inverse: Tensor, camera: CameraTensors) -> Tensor:
     """Cosine between ray and surface normal, (h, w); 0 where there is no depth, 1 where no neighbour has any.
 
-    The plane ``n . X = 1`` of the camera's frame has the inverse depth ``n . K^-1 p``, linear in the pixel p, so its
+    The plane ``n . X = 1`` in the camera frame has the inverse depth ``n . K^-1 p``, linear in the pixel p, so its
     gradient gives n, and the cosine is ``1 / (|n| |X|)``.
     """
     height, width = inverse.shape
@@ -267,7 +263,7 @@ def _cosine(inverse: Tensor, camera: CameraTensors) -> Tensor:
 
 
 def _slope(inverse: Tensor, axis: int) -> Tensor:
-    """Change to the next pixel along an axis: the smaller of the two one-sided ones, which crosses no jump."""
+    """The smaller of the two one-sided differences along an axis, which crosses no jump."""
     step = inverse.diff(dim=axis)
     found = inverse > 0
     valid = found.narrow(axis, 0, step.shape[axis]) & found.narrow(axis, 1, step.shape[axis])
@@ -278,20 +274,8 @@ def _slope(inverse: Tensor, axis: int) -> Tensor:
     return torch.where(slope.isfinite(), slope, 0)
 
 
-def _slab_planes(grid: VoxelGrid, features: Tensor, memory: int) -> int:
-    _, height, width = grid.shape  # type: ignore[misc]
-    return max(1, memory // (LIVE * features.element_size() * height * width))
-
-
-def _check_grid(who: str, grid: Any) -> None:
-    if not isinstance(grid, VoxelGrid):
-        raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
-    if grid.world_from_lattice.dim() != 2:
-        raise GridError(f"{who}: grid must be of one scene; got {grid}")
-
-
 def _each(who: str, name: str, value: Tensor | Iterable[Tensor] | None, views: int) -> Iterator[Tensor | None]:
-    """The maps of the views one after another; None for each where there are none."""
+    """The maps of the views one after another; None for every view without maps."""
     if value is None:
         yield from (None,) * views
         return
@@ -312,9 +296,7 @@ def _checked(who: str, view: int, depth: Any, colours: Any, background: Any) -> 
     if colours is not None:
         check_geometry(who, f"colours[{view}]", colours, "(3, h, w)", rank=3, dtypes=(depth.dtype,))
         if tuple(colours.shape) != (3, *size):
-            raise ShapeError(
-                f"{who}: colours[{view}] must be {(3, *size)}, of its depth map; got {tuple(colours.shape)}"
-            )
+            raise ShapeError(f"{who}: colours[{view}] must be {(3, *size)}; got {tuple(colours.shape)}")
         check_finite(who, f"colours[{view}]", colours)
     if background is not None:
         check_mask(who, f"background[{view}]", background, size, "(h, w)")

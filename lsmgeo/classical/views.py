@@ -1,4 +1,4 @@
-"""Which neighbours a view is matched with, and between which depths it is swept."""
+"""The neighbours that a view is matched with, and the depth range in which it is swept."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ __all__ = [
     "select_neighbours",
 ]
 
-# Below the first angle a pair says little about depth, above the last its patches hardly look alike any more.
+# In degrees: below the first a pair determines depth poorly, above the last its patches hardly match.
 SMALLEST_ANGLE, BEST_ANGLE, LARGEST_ANGLE = 1.5, 10.0, 60.0
-# Neighbours nearer to each other than this add no viewpoint.
+# In degrees: neighbours that are closer to each other add no viewpoint.
 SMALLEST_SPACING = 1.0
-# A view that shares fewer sparse points, or less of the frustum, sees something else.
+# A view that shares fewer sparse points, or less of the frustum, is not a neighbour.
 LEAST_SHARED_POINTS, LEAST_SHARED_FRUSTUM = 5, 0.2
 FRUSTUM_SHAPE = (6, 6, 8)
-# Fewer depths do not tell a range.
+# Fewer depths are not enough for a range.
 LEAST_DEPTHS = 10
-# Of a picture's width: what moves more between two views cannot be matched, what moves less has no depth.
+# Fractions of the image width: larger disparities cannot be matched, smaller ones do not determine depth.
 LARGEST_DISPARITY, SMALLEST_DISPARITY = 0.3, 0.01
 
 
@@ -42,7 +42,7 @@ def common_point(cameras: CameraTensors) -> np.ndarray:
     origins = centers(cameras).double().numpy()
     middle = origins.mean(0)
     right = np.einsum("vij,vj->i", projectors, origins - middle)
-    # Parallel axes meet nowhere; the pseudo-inverse then stays among the cameras instead of failing.
+    # If axes are parallel, the pseudo-inverse gives a point among the cameras.
     return np.asarray(middle + np.linalg.pinv(projectors.sum(0), rcond=1e-6) @ right)
 
 
@@ -51,23 +51,23 @@ def select_neighbours(
 ) -> list[int]:
     """Choose the views to match with a reference view.
 
-    Candidates are ranked by the angle under which both see the same thing, best near 10 degrees, times how much they
-    share: sparse points where the scene has any, else places all over the reference's frustum that the other view sees
-    too. The angle is the median over these. A view that stands where an already chosen one stands is passed over.
-    (Score after Yao et al., "MVSNet", ECCV 2018, section 4.1.)
+    Candidates are ranked by a weight of the triangulation angle, best near 10 degrees, times what they share: sparse
+    points if the scene has them, otherwise points all over the frustum of the reference that the other view sees. The
+    angle is the median over these points. A view at the position of one that is already chosen is skipped. (Score
+    after Yao et al., "MVSNet", ECCV 2018, section 4.1.)
 
     Args:
-        scene: the posed photographs.
+        scene: posed images.
         view: index of the reference.
-        count: how many are wanted.
-        near: nearest depth of what the reference sees, world units; by default `default_depth_range`.
+        count: the largest number of neighbours.
+        near: nearest depth that the reference sees, world units; by default `default_depth_range`.
         far: farthest depth.
 
     Returns:
         At most ``count`` indices, best first.
 
     Raises:
-        OptionError: no other view is usable, or the depth range is needed and cannot be told.
+        OptionError: no other view is usable, or the depth range is needed and cannot be inferred.
     """
     check_whole("select_neighbours", "view", view, 0, len(scene) - 1)
     check_whole("select_neighbours", "count", count, 1)
@@ -106,31 +106,31 @@ def select_neighbours(
             break
     if not chosen:
         raise OptionError(
-            f"view {view} ({scene.names[view]}) has no usable neighbour: no other view sees the same from "
-            f"{SMALLEST_ANGLE} to {LARGEST_ANGLE} degrees aside"
+            f"view {view} ({scene.names[view]}) has no usable neighbour: no other view sees the same points at "
+            f"an angle of {SMALLEST_ANGLE} to {LARGEST_ANGLE} degrees"
         )
     return chosen
 
 
 def _frustum_points(scene: PosedImages, view: int, near: float, far: float) -> np.ndarray:
-    """World points (N, 3) all over a view's frustum, evenly in the picture and in inverse depth."""
+    """World points (N, 3) all over the frustum of a view, evenly in the image and in inverse depth."""
     camera = resize(scene.camera(view), *FRUSTUM_SHAPE[1:])
     depths = depth_planes(near, far, FRUSTUM_SHAPE[0], spacing="inverse")
     return FrustumGrid(camera, depths, FRUSTUM_SHAPE[1:]).centers().reshape(-1, 3).double().numpy()
 
 
 def measured_depth_range(scene: PosedImages, view: int) -> tuple[float, float] | None:
-    """Nearest and farthest depth of the sparse points that a view observes, or of the depth that comes with it.
+    """Nearest and farthest depth of the sparse points that a view observes, or of its measured depth map.
 
     Args:
-        scene: the posed photographs.
+        scene: posed images.
         view: index of the view.
 
     Returns:
         Their 2nd and 98th percentile, widened, world units; None where there are too few.
 
     Raises:
-        DataError: the depth that comes with the photograph cannot be read.
+        DataError: a measured depth map cannot be read.
     """
     check_whole("measured_depth_range", "view", view, 0, len(scene) - 1)
     depth = np.empty(0)
@@ -152,19 +152,19 @@ def depth_of(scene: PosedImages, view: int, points: np.ndarray) -> np.ndarray:
 
 
 def default_depth_range(scene: PosedImages, view: int) -> tuple[float, float]:
-    """Nearest and farthest depth of what a view shows, as told by what was measured, or by the cameras.
+    """Nearest and farthest depth of what a view shows, inferred from measured depth or from the cameras.
 
-    Where there is no `measured_depth_range`, around the point where the optical axes meet: what lies there fills the
-    pictures, so its size is about that of the field of view at that depth. Where they meet nowhere, the depths at which
-    things move between this camera and the next by 1 to 30 % of the picture's width.
+    Without a `measured_depth_range`, around the point where the optical axes meet: an object there fills the images, so
+    its size is about that of the field of view at that depth. If they do not meet, the depths at which disparities
+    between this camera and the nearest one are 1 to 30 % of the image width.
 
     Args:
-        scene: the posed photographs.
+        scene: posed images.
         view: index of the view.
 
     Raises:
-        OptionError: the depth cannot be told; ``near`` and ``far`` must be given.
-        DataError: the depth that comes with the photograph cannot be read.
+        OptionError: the depth cannot be inferred; ``near`` and ``far`` must be given.
+        DataError: a measured depth map cannot be read.
     """
     measured = measured_depth_range(scene, view)
     if measured is not None:
@@ -174,7 +174,7 @@ def default_depth_range(scene: PosedImages, view: int) -> tuple[float, float]:
     middle = float(depth_of(scene, view, common_point(scene.cameras)[None])[0])
     origins = centers(scene.cameras).numpy()
     away = np.linalg.norm(origins - origins[view], axis=1)
-    # Parallel axes: rounding alone decides how far before or behind the cameras they meet.
+    # If axes are parallel, their common point depends on rounding only.
     if middle > 1e-6 * away.max():
         radius = 0.75 * middle * float(min(0.5 * width / K[0, 0], 0.5 * height / K[1, 1]))
         radius = min(radius, 0.5 * middle)
@@ -186,7 +186,7 @@ def default_depth_range(scene: PosedImages, view: int) -> tuple[float, float]:
 
 
 def _angles(first: np.ndarray, second: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Angles in degrees under which points (N, 3) see two centres, (N,)."""
+    """The angles (N,) in degrees between the rays from points (N, 3) to two camera centres."""
     a, b = first - points, second - points
     norms = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     return np.degrees(np.arccos(np.clip((a * b).sum(1) / np.maximum(norms, 1e-300), -1, 1)))

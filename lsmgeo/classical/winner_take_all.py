@@ -1,4 +1,4 @@
-"""The lowest and second-lowest local minimum of a cost along every ray, from planes that come slab by slab."""
+"""The lowest and second-lowest local minimum of a cost along every ray, from slabs of planes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lsmgeo.classical.correlation import on_threads
 
 __all__ = ["WinnerTakeAll"]
 
-# A second minimum counts against the first only where it is another place, not the noise around the same one.
+# Minima that are closer are one: the second is noise around the first.
 SAME_PLANES = 2.5
 
 Floats = npt.NDArray[np.float32]
@@ -19,16 +19,16 @@ Mask = npt.NDArray[np.bool_]
 
 
 class WinnerTakeAll:
-    """Running winners of a sweep: what is kept does not grow with the number of planes.
+    """Running winners of a sweep: memory does not grow with the number of planes.
 
     A local minimum is placed between planes by the parabola through it and its neighbours in inverse depth, in which
-    samples move evenly, so that any spacing of the planes will do.
+    samples move evenly, so that planes may have any spacing.
 
     Args:
-        depths: (P,) the planes' depths, ascending.
+        depths: (P,) of the planes, ascending.
         size: (h, w).
-        unrelated: what nobody sees costs; only what costs less can win.
-        apart: planes within which minima are one place.
+        unrelated: the cost of a site that no neighbour sees; only lower costs can win.
+        apart: planes within which minima are one.
     """
 
     def __init__(self, depths: Tensor, size: tuple[int, int], unrelated: float, apart: float = SAME_PLANES):
@@ -41,7 +41,7 @@ class WinnerTakeAll:
         self.place: Floats = np.full(size, -1, np.float32)
 
     def push(self, costs: Tensor, seen: Tensor) -> None:
-        """Take the next planes' costs (d, h, w), and where enough neighbours see them."""
+        """Add the costs (d, h, w) of the next planes, and where enough neighbours see them."""
         planes = np.concatenate((self.before[0], costs.numpy(force=True)))
         sees = np.concatenate((self.before[1], seen.numpy(force=True)))
         first = self.count - len(self.before[0])
@@ -60,17 +60,17 @@ class WinnerTakeAll:
         self.before = (planes[-2:].copy(), sees[-2:].copy())
 
     def _visit(self, index: int, costs: Floats, seen: Mask, rows: slice) -> None:
-        """Take the minima of one plane, between its neighbours (3, h, w), in some rows."""
+        """Add the minima of one plane, between its neighbours (3, h, w), in some rows."""
         best, second, place = (values[rows].reshape(-1) for values in (self.best, self.second, self.place))
         previous, middle, following = costs.reshape(3, -1)
         is_minimum = middle < second
         is_minimum &= middle <= previous
         is_minimum &= middle < following
         is_minimum &= seen[1].reshape(-1)
-        # Few pixels have a minimum here that counts; all else is done for these alone.
+        # Few pixels have such a minimum here; the rest is done only for these.
         at = np.flatnonzero(is_minimum)
         cost, lowest, winner = middle[at], best[at], place[at]
-        # Beside what nobody sees there is no curve to follow.
+        # Beside a site that no neighbour sees there is no parabola.
         has_sides = (seen[0] & seen[2]).reshape(-1)[at]
         found = index + np.where(has_sides, self._offset(index, previous[at], cost, following[at]), 0)
         elsewhere = (found - winner > self.apart) | (winner < 0)
@@ -81,19 +81,19 @@ class WinnerTakeAll:
         place[at] = np.where(better, found, winner)
 
     def _offset(self, index: int, before: Floats, cost: Floats, after: Floats) -> Floats:
-        """Where the parabola through three planes has its vertex, in planes from the middle one, in [-0.5, 0.5]."""
+        """The vertex of the parabola through three planes, in planes from the middle one, in [-0.5, 0.5]."""
         first, middle, last = self.inverse[index - 1 : index + 2]
         step, next_step = first - middle, middle - last
-        # Its derivative by inverse depth is, half way between two planes, their slope; it is 0 at the vertex.
+        # Halfway between two planes its derivative is their slope; it is 0 at the vertex.
         slope, next_slope = (cost - before) / step, (after - cost) / next_step
         vertex = -0.5 * (slope * next_step + next_slope * step) / np.maximum(next_slope - slope, 1e-30)
         return np.where(vertex > 0, vertex / next_step, vertex / step).astype(np.float32)
 
     def depth(self) -> Tensor:
-        """Depth of the winners (h, w) float32, linear in inverse depth between planes; 0 where there is none."""
+        """Depth of the winners (h, w) float32, linear in inverse depth between planes; 0 where none won."""
         inverse = np.interp(self.place, np.arange(len(self.inverse)), self.inverse)
         return torch.from_numpy(np.where(self.place >= 0, 1 / inverse, 0).astype(np.float32))
 
     def uniqueness(self) -> Tensor:
-        """By how much the second-lowest minimum elsewhere is above the lowest, in [0, 1], (h, w)."""
+        """By how much the second-lowest minimum at another depth is above the lowest, in [0, 1], (h, w)."""
         return torch.from_numpy(((self.second - self.best) / np.maximum(self.second, 1e-3)).clip(0, 1))

@@ -24,7 +24,12 @@ __all__ = ["REPORTS", "ReportEntry", "evaluate"]
 
 
 class ReportEntry(NamedTuple):
-    """A report by its name, and its defaults."""
+    """A report, and its defaults.
+
+    ``make`` takes the models under test, of one resolution of voxels or one size of images; the shapes to test on, with
+    depth for depth models; the largest number of views; and the options. It raises `OptionError` if the models do not
+    fit together.
+    """
 
     make: Callable[[Sequence[Method], Shapes, int, Options], Report]
     views: int  # the largest number, as in the paper

@@ -22,17 +22,10 @@ def report_backgrounds(methods: Sequence[Method], shapes: Shapes, views: int, op
     The paper trains and tests "V-LSM w/bg" on random images as backgrounds; a model that was trained on white only
     shows the gain.
 
-    Args:
-        methods: voxel models of one resolution.
-        shapes: the shapes to test on.
-        views: 4 in the paper.
-        options: background, threshold, batch.
+    Options: background, threshold, batch.
 
     Returns:
         Table "views" with two rows per model.
-
-    Raises:
-        OptionError: models of different resolutions.
     """
     backgrounds = {"white": "white", "random": options.background}
     measured = {

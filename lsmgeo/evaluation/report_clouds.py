@@ -34,18 +34,11 @@ def report_clouds(methods: Sequence[Method], shapes: Shapes, views: int, options
     Depth maps of all methods are cut by the silhouettes (plane sweep has no depth at some pixels of the object).
     Kar et al. 2017, figures 4 and 5.
 
-    Args:
-        methods: depth models of one size of images.
-        shapes: the shapes to test on; all are drawn.
-        views: the largest number, 20 in the paper.
-        options: planes, window.
+    All shapes are drawn. Options: planes, window.
 
     Returns:
         A figure per shape and a PLY file per cloud; tables of the mean depth error and of the F-score of the cloud
         against that of the true depth.
-
-    Raises:
-        OptionError: models of different sizes.
     """
     size = shared(methods, "size")
     counts = [count for count in COUNTS if count < views] + [views]

@@ -30,18 +30,11 @@ def report_depth(methods: Sequence[Method], shapes: Shapes, views: int, options:
     counts if it is on the object, its true depth is in that range, and plane sweep has a depth. The median absolute
     error of each depth map is averaged over the views of a shape, the shapes of a category, and the categories.
 
-    Args:
-        methods: depth models of one size of images.
-        shapes: the shapes to test on, with depth.
-        views: 10 in the paper.
-        options: planes, window, batch.
+    Options: planes, window, batch.
 
     Returns:
         Table "categories" in world units. Table "measures": also mean errors, the median over the pixels where plane
         sweep is sure (a confidence of at least 0.05), and errors over all pixels of the object.
-
-    Raises:
-        OptionError: models of different sizes.
     """
     size = shared(methods, "size")
     scores = {name: Scores() for name in (SWEEP, *(method.name for method in methods))}

@@ -20,17 +20,10 @@ HULL_FALLS = "The 0.75 hull drops from 4 to 5 views because it needs all of 4 si
 def report_iou(methods: Sequence[Method], shapes: Shapes, views: int, options: Options) -> Report:
     """Measure IoU after 1, 2, ... views: the mean over categories, and every category.
 
-    Args:
-        methods: voxel models of one resolution.
-        shapes: the shapes to test on.
-        views: 8 in the paper.
-        options: threshold, batch.
+    Options: threshold, batch.
 
     Returns:
         Table "views", a table of the categories per model, and a figure of the curves.
-
-    Raises:
-        OptionError: models of different resolutions.
     """
     scores = measure_iou(methods, shapes, views, options, hulls=True)
     table = table_of_views("voxel IoU [%], views:", scores, views, _known(methods))

@@ -32,17 +32,10 @@ def report_order(methods: Sequence[Method], shapes: Shapes, views: int, options:
     deviation and the range of IoU over the orders; the deviation of each voxel's probability, averaged over the voxels
     that are occupied in any order; the share of these that are empty in another; and the range of the whole set's IoU.
 
-    Args:
-        methods: voxel models of one resolution.
-        shapes: the shapes to test on.
-        views: the largest number, 8 in the paper.
-        options: orders (8), seed, threshold, batch.
+    Options: orders, seed, threshold, batch.
 
     Returns:
         A table per model, of means over categories; a figure of IoU with the deviation as error bars.
-
-    Raises:
-        OptionError: models of different resolutions.
     """
     counts = [count for count in COUNTS if count < views] + ([views] if views > 1 else [])
     scores = {(method.name, count): Scores() for method in methods for count in counts}

@@ -24,17 +24,10 @@ def report_pose_noise(methods: Sequence[Method], shapes: Shapes, views: int, opt
     Every camera keeps looking at the object (`lsmgeo.cameras.perturb`). Its axis, and its angle as a share of the
     largest, are the same for all largest angles: a curve is of one draw (Kar et al. 2017, appendix A.1).
 
-    Args:
-        methods: voxel models of one resolution, such as one trained without noise and one with.
-        shapes: the shapes to test on.
-        views: 4 in the paper.
-        options: degrees, seed, threshold, batch.
+    Options: degrees, seed, threshold, batch.
 
     Returns:
         Table "degrees" with the IoU after all views, and a figure of the curves.
-
-    Raises:
-        OptionError: models of different resolutions.
     """
     angles = tuple(sorted(set(options.degrees)))
     resolution = shared(methods, "resolution")

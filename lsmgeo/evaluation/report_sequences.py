@@ -22,17 +22,10 @@ MOST_DRAWN = 26
 def report_sequences(methods: Sequence[Method], shapes: Shapes, views: int, options: Options) -> Report:
     """Draw the predictions after each of a sequence of views (Kar et al. 2017, figure 3), and measure their IoU.
 
-    Args:
-        methods: voxel models of one resolution: in the paper V-LSM and 3D-R2N2 w/pose.
-        shapes: the shapes to test on; the first 26 are drawn.
-        views: 4 in the paper.
-        options: threshold, batch.
+    The first 26 shapes are drawn. Options: threshold, batch.
 
     Returns:
         A figure per shape and a table of IoU per model.
-
-    Raises:
-        OptionError: models of different resolutions.
     """
     scores = {method.name: Scores() for method in methods}
     figures: dict[str, bytes] = {}

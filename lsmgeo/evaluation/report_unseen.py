@@ -22,18 +22,15 @@ def report_unseen(methods: Sequence[Method], shapes: Shapes, views: int, options
     categories minus that of the model, on the same shapes and views; the mean over all such categories (Kar et al.
     2017, section 4, "Generalization"). How a model was trained is read from its file.
 
-    Args:
-        methods: of every network one model trained on all categories and at least one trained on some: in the paper
-            V-LSM and 3D-R2N2 w/pose, each trained on all, on the first and on the second part of the categories.
-        shapes: the shapes to test on, of all categories.
-        views: 8 in the paper.
-        options: threshold, batch.
+    Of every network it needs one model trained on all categories and at least one trained on some: in the paper V-LSM
+    and 3D-R2N2 w/pose, each trained on all, on the first and on the second part of the categories. Options: threshold,
+    batch.
 
     Returns:
         Tables "drop" and "categories" (with all views), and a figure of the curves.
 
     Raises:
-        OptionError: a model has no counterpart, or models of different resolutions.
+        OptionError: a model has no counterpart.
     """
     pairs = _pairs(methods, set(shapes.categories))
     scores = measure_iou(methods, shapes, views, options, hulls=False)

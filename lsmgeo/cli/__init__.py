@@ -1,4 +1,4 @@
-"""The command line: `main`, and one file a command. Heavy imports wait until a command runs."""
+"""The command line: `main`, and one file per command. Heavy modules are imported when a command runs."""
 
 from lsmgeo.cli.main import main
 

@@ -1,4 +1,4 @@
-"""`lsmgeo convert`: scenes for other programs, and released data sets as shards."""
+"""`lsmgeo convert`: scenes in the formats of other programs, and released data sets as shards."""
 
 from __future__ import annotations
 
@@ -16,17 +16,16 @@ def convert(
     splits: str | None = None,
     jobs: int = -1,
 ) -> None:
-    """Write posed photographs in the form that another program reads, straightened where their lens bent them.
+    """Write posed images in the format of another program, without lens distortion; or a data set as shards.
 
     Args:
-        scene: posed photographs in any form that lsmgeo reads; for shards, a whole tree of the LSM release or of
-            3D-R2N2's renderings.
+        scene: posed images in any supported format; for shards, a tree of the LSM release or of the renderings of
+            3D-R2N2.
         to: "colmap" is a COLMAP model as text, "transforms" a transforms.json of instant-ngp and nerfstudio, "cameras"
-            a plain JSON of K and world-to-camera matrices; "shards" is a training set, as lsmgeo render makes it.
-        out: folder to make for the photographs and their cameras; it must not exist or be empty. Run again, shards go
-            on where they were.
-        splits: for shards, a splits.json that says what is trained on; by default names decide.
-        jobs: for shards, worker processes; -1 takes all cores.
+            a plain JSON of K and world-to-camera matrices; "shards" is a training set, as from lsmgeo render.
+        out: folder for the images and their cameras; it must not exist, or be empty. Run again, shards are continued.
+        splits: for shards, a splits.json with the splits; by default they follow from the names.
+        jobs: for shards, worker processes; -1 uses all cores.
     """
     from lsmgeo import data
     from lsmgeo.errors import OptionError
@@ -42,19 +41,16 @@ def convert(
     images = data.open(scene)
     write = {"colmap": data.write_colmap, "transforms": data.write_transforms, "cameras": data.write_cameras_json}[to]
     folder = write(images, out)
-    left = [
-        what
-        for what, there in (
-            ("points", images.points is not None and len(images.points.positions) > 0 and to != "colmap"),
-            ("depth", images.depths is not None),
-            ("voxels", images.voxels is not None),
-        )
-        if there
-    ]
-    bent = sum(lens is not None for lens in images.lenses or ())
-    print(f"scene:       {len(images)} photographs, {images.source}")
-    if bent:
-        print(f"straight:    {bent} photographs had distortion and are written without, as PNG")
-    if left:
-        print(f"left out:    {', '.join(left)}: {to} is written without")
+    has = {
+        "points": images.points is not None and len(images.points.positions) > 0 and to != "colmap",
+        "depth": images.depths is not None,
+        "voxels": images.voxels is not None,
+    }
+    left_out = [what for what, exists in has.items() if exists]
+    distorted = sum(lens is not None for lens in images.lenses or ())
+    print(f"scene:       {len(images)} images, {images.source}")
+    if distorted:
+        print(f"undistorted: {distorted} images had lens distortion and are written without it, as PNG")
+    if left_out:
+        print(f"left out:    {', '.join(left_out)}, which {to} is written without")
     print(f"written:     {to} in {folder.resolve()}")

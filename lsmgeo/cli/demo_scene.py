@@ -1,8 +1,8 @@
-"""The demonstration: a scene known in closed form goes through both operators, and its depth comes back.
+"""The demonstration: the depth of an analytic scene is recovered with both operators.
 
-A textured sphere on a textured floor is ray traced from six places. The pictures are unprojected into a voxel grid,
-where their variance tells how far the views agree; agreement is swept back into one of the views, and the highest peak
-along every ray is the depth, compared with the exact one.
+A textured sphere on a textured floor is ray traced from six viewpoints. The images are unprojected into a voxel grid,
+in which a low variance means that the views agree; the agreement is projected into a plane sweep of one view, and the
+highest peak along every ray is the depth, which is compared with the exact one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lsmgeo.cameras import CameraTensors, centers, orbit, project, unproject_dep
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["DemoResult", "run_demo", "write_picture"]
+__all__ = ["DemoResult", "run_demo", "write_figure"]
 
 RADIUS = 0.4
 FLOOR = -RADIUS
@@ -41,16 +41,16 @@ WAVES = (
 
 @dataclass(frozen=True, eq=False)
 class DemoResult:
-    """What the demonstration computes.
+    """The results of the demonstration.
 
     Attributes:
         images: (V, 3, H, W) the rendered views.
         cameras: leading shape (V,).
         grid: the voxels.
-        agreement: (D, H, W) in [0, 1], 1 where all views that see a voxel show the same.
+        agreement: (D, H, W) in [0, 1], 1 where all views that see a voxel have the same colour.
         view: index of the view whose depth is recovered.
-        true_depth: (H, W) exact camera z, 0 outside the scene's box.
-        depth: (H, W) recovered camera z, 0 where nothing is found.
+        true_depth: (H, W) exact camera z, 0 outside the box of the scene.
+        depth: (H, W) recovered camera z, 0 where there is no peak.
         error: (H, W) relative error, NaN outside the visible surface.
         seconds: time of the operators.
     """
@@ -78,25 +78,20 @@ def _texture(points: Tensor) -> Tensor:
     return 0.5 + 0.25 * (waves[..., :3] + waves[..., 3:])
 
 
-def _picture(
-    cameras: CameraTensors, scene: scenes.Scene, lower: Tensor, upper: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The textured scene: images (V, 3, H, W), camera z (V, H, W), and surface points (V, H, W, 3).
-
-    Surfaces outside the box are left out; their depth is 0.
-    """
+def _render(cameras: CameraTensors, scene: scenes.Scene, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The textured scene: images (V, 3, H, W), camera z (V, H, W), 0 outside the box, and points (V, H, W, 3)."""
     dark = scenes.Lights(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(3))
     depth = scenes.render([scene], cameras.at(None), dark, dtype=torch.float64).depth[0]
     points = unproject_depth(cameras, depth[None])[0]
     hit = (depth > 0) & ((points >= lower) & (points <= upper)).all(-1)
-    # Noise, different in every view: a plain background would agree with itself in empty space.
+    # Noise that differs between views: views of a uniform background would agree in empty space.
     noise = torch.rand(points.shape[:-1], generator=torch.Generator().manual_seed(0), dtype=points.dtype)
     colours = torch.where(hit[..., None], _texture(points), noise[..., None])
     return colours.permute(0, 3, 1, 2), torch.where(hit, depth, 0.0), points
 
 
 def _seen_by(points: Tensor, cameras: CameraTensors, scene: scenes.Scene) -> Tensor:
-    """How many cameras see each surface point (H, W, 3): in the picture, and with nothing in between."""
+    """The number of cameras that see each surface point (H, W, 3): in the image, and not occluded."""
     origins = centers(cameras)[:, None]  # (V, 1, 3)
     towards = points.reshape(1, -1, 3) - origins  # (V, H * W, 3)
     first = scenes.trace([scene], origins.expand_as(towards).reshape(1, -1, 3), towards.reshape(1, -1, 3)).distance
@@ -108,7 +103,7 @@ def run_demo(*, size: tuple[int, int] = (120, 160), voxels: int = 72, planes: in
     """Run the demonstration.
 
     Args:
-        size: (H, W) of the pictures.
+        size: (H, W) of the images.
         voxels: voxels along the longest side of the grid.
         planes: depth planes of the sweep.
 
@@ -117,14 +112,14 @@ def run_demo(*, size: tuple[int, int] = (120, 160), voxels: int = 72, planes: in
     """
     height, width = size
     view = 2
-    # Close together, so that hardly any view's sight of the floor is blocked by the sphere.
+    # Close together, so that the sphere hides little of the floor in any view.
     azimuths = torch.tensor([68.0, 77.0, 86.0, 94.0, 103.0, 112.0], dtype=torch.float64)
     elevations = torch.tensor([34.0, 46.0, 40.0, 33.0, 48.0, 39.0], dtype=torch.float64)
     cameras = orbit(azimuths, elevations, 2.4, focal_length=1.45 * width, height=height, width=width)
     grid = VoxelGrid((voxels, voxels * 2 // 3, voxels), lower=(-0.75, -0.5, -0.75), upper=(0.75, 0.5, 0.75))
     lower, upper = torch.tensor(grid.lower).double(), torch.tensor(grid.upper).double()
     scene = scenes.Scene([scenes.sphere((0, 0, 0), RADIUS), scenes.half_space((0, FLOOR, 0), (0, 1, 0))])
-    images, depths, points = _picture(cameras, scene, lower, upper)
+    images, depths, points = _render(cameras, scene, lower, upper)
     images = images.float()
 
     start = time.perf_counter()
@@ -154,8 +149,8 @@ def _peak(scores: Tensor, depths: Tensor) -> Tensor:
     return torch.where(middle > 0, depths[0] + place * spacing, 0.0).double()
 
 
-def write_picture(result: DemoResult, path: Path) -> Path:
-    """Draw the demonstration as one PNG: the views, agreement in space, and depth true, recovered and compared.
+def write_figure(result: DemoResult, path: Path) -> Path:
+    """Draw the demonstration as one PNG: the views, the agreement, and true depth, recovered depth and error.
 
     Raises:
         DataError: the file cannot be written.
@@ -167,11 +162,13 @@ def write_picture(result: DemoResult, path: Path) -> Path:
     rows = figure.subfigures(2, 1, height_ratios=(1, 1.75))
     assert isinstance(rows, np.ndarray)
     top, bottom = rows
-    figure.suptitle("Depth of a known scene, recovered by unprojecting its pictures and sweeping the result back")
+    figure.suptitle(
+        "Depth of an analytic scene, recovered by unprojecting its images and projecting the result into a plane sweep"
+    )
     for view, axes in enumerate(top.subplots(1, len(result.images))):
         axes.imshow(result.images[view].permute(1, 2, 0).clamp(0, 1))
         chosen = view == result.view
-        axes.set_title(f"input view {view}" + (" (depth wanted here)" if chosen else ""), fontsize=9)
+        axes.set_title(f"input view {view}" + (" (depth of this view)" if chosen else ""), fontsize=9)
         axes.set_xticks([])
         axes.set_yticks([])
         for spine in axes.spines.values():
@@ -183,12 +180,12 @@ def write_picture(result: DemoResult, path: Path) -> Path:
     found = torch.where(result.error.isfinite() & (result.depth > 0), result.depth, torch.nan)
     low, high = float(shown[shown.isfinite()].min()), float(shown[shown.isfinite()].max())
     for axes, values, title in ((truth, shown, "true depth (ray traced)"), (depth, found, "recovered depth")):
-        picture = axes.imshow(values, cmap="viridis", vmin=low, vmax=high)
+        drawn = axes.imshow(values, cmap="viridis", vmin=low, vmax=high)
         axes.set_title(f"{title}, view {result.view}")
-        figure.colorbar(picture, ax=axes, location="bottom", label="camera z [world units]")
-    picture = error.imshow(100 * result.error, cmap="magma", vmin=0, vmax=3)
+        figure.colorbar(drawn, ax=axes, location="bottom", label="camera z [world units]")
+    drawn = error.imshow(100 * result.error, cmap="magma", vmin=0, vmax=3)
     error.set_title(f"relative error, median {100 * result.median_error:.2f} %\n(the sphere hides the floor beside it)")
-    figure.colorbar(picture, ax=error, location="bottom", label="|recovered - true| / true [%]", extend="max")
+    figure.colorbar(drawn, ax=error, location="bottom", label="|recovered - true| / true [%]", extend="max")
     for axes in (truth, depth, error):
         axes.set_facecolor("0.85")
         axes.set(xlabel="x [pixel]", ylabel="y [pixel]")
@@ -196,7 +193,7 @@ def write_picture(result: DemoResult, path: Path) -> Path:
 
 
 def _draw_slice(axes: Axes, result: DemoResult) -> None:
-    """The upright slice x = 0 of the agreement, with the true outline; the cameras are on the right."""
+    """The slice x = 0 of the agreement, with the true surface; the cameras are on the right."""
     from matplotlib.patches import Circle
 
     grid = result.grid
@@ -204,10 +201,10 @@ def _draw_slice(axes: Axes, result: DemoResult) -> None:
     assert isinstance(grid.upper, tuple)
     values = result.agreement[:, :, result.agreement.shape[2] // 2].T  # (H, D): y upwards, z to the right
     extent = (grid.lower[2], grid.upper[2], grid.lower[1], grid.upper[1])
-    picture = axes.imshow(values, cmap="gray", vmin=0, vmax=1, extent=extent, origin="lower")
+    drawn = axes.imshow(values, cmap="gray", vmin=0, vmax=1, extent=extent, origin="lower")
     axes.axhline(FLOOR, color="tab:red", linewidth=1.5, linestyle=":", label="true surface")
     axes.add_patch(Circle((0, 0), RADIUS, fill=False, color="tab:red", linewidth=1.5, linestyle=":"))
     axes.legend(loc="upper left", fontsize=8)
     axes.set(xlabel="z, towards the cameras [world units]", ylabel="y, up [world units]")
     axes.set_title("where the views agree, slice x = 0")
-    axes.figure.colorbar(picture, ax=axes, location="bottom", label=f"exp(-variance between views / {TOLERANCE})")
+    axes.figure.colorbar(drawn, ax=axes, location="bottom", label=f"exp(-variance between views / {TOLERANCE})")

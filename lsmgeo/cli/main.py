@@ -1,4 +1,4 @@
-"""What runs a command of the command line: its arguments, its errors in one line, its exit status."""
+"""The command line: its arguments, its errors in one line, and its exit status."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: by default those of the process.
 
     Returns:
-        The exit status: 0, 1 or 3 as `info` says, 2 after a wrong argument or a file that cannot be used, 130 after an
-        interrupt, 141 where what is printed is no longer read.
+        The exit status: that of the command, 2 after a wrong argument or a file that cannot be used, 130 after an
+        interrupt, 141 if the output is closed.
     """
     import os
     from argparse import ArgumentError
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             sys.stdout.flush()
         except BrokenPipeError:
-            # Whoever read has read enough, as head does; what is left to print goes nowhere.
+            # The reader of the output, such as head, has closed it.
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
             return 141
         raise
@@ -97,8 +97,8 @@ def _run(arguments: Sequence[str] | None) -> int:
         as_positional=True,
         prog="lsmgeo",
         version=release,
-        description="Shape from posed photographs, training sets of rendered shapes, models trained and measured.",
-        # Errors come here, to become one line; and an option is what it is called, not how its name begins.
+        description="Shape from posed photos; training sets of rendered shapes; training and testing of models.",
+        # Errors are caught in `main`; options must be written in full.
         exit_on_error=False,
         allow_abbrev=False,
     )
@@ -106,18 +106,18 @@ def _run(arguments: Sequence[str] | None) -> int:
 
 
 def _plain(words: Sequence[str], commands: Iterable[Callable[..., object]]) -> list[str]:
-    """Arguments as the parser has them: ``--quiet true`` as the flag ``--quiet``, every ``--set`` as one more."""
+    """Arguments in the form of the parser: ``--quiet true`` becomes ``--quiet``, and ``--set`` appends."""
     parameters = (parameter for command in commands for parameter in signature(command).parameters.values())
     flags = "|".join(sorted({parameter.name for parameter in parameters if parameter.annotation == "bool"}))
     text = "\0".join(words)
     text = re.sub(rf"(?<![^\0])--({flags})[=\0](?i:true|yes)(?![^\0])", r"--\1", text)
     text = re.sub(rf"(?<![^\0])--({flags})[=\0](?i:false|no)(?![^\0])", r"--no_\1", text)
-    # jsonargparse appends to a list with "+"; that an option is given again and again is how others do it.
+    # jsonargparse appends to a list with "+"; other command lines do so for a repeated option.
     return re.sub(r"(?<![^\0])--set(?![^=\0])", "--set+", text).split("\0") if words else []
 
 
 def _reason(message: str) -> str:
-    """What the parser of the arguments says over several lines, in one."""
+    """A message of the parser, which may have several lines, in one line."""
     found = re.match(r'Parser key "(.+?)":(.*?)(?:Given value type:.*?Given|Got) value: ([^\n]*)', message, re.DOTALL)
     if found:
         name, expected, value = found.groups()

@@ -29,23 +29,24 @@ def render(
     on_error: Literal["skip", "raise"] = "skip",
     overwrite: bool = False,
 ) -> None:
-    """Make a training set: views, depth and voxels of many shapes, in tar shards; run again, it goes on where it was.
+    """Make a training set: views, depth and voxels of many shapes, in tar shards; run again, it is continued.
 
     Args:
         source: "synthetic-13", or a folder of meshes such as a ShapeNetCore tree.
         shapes: number of shapes; by default all meshes of the folder.
-        views: pictures of each shape.
-        out: folder for the shards; created where it does not exist.
-        size: height and width of the pictures in pixels.
+        views: images of each shape.
+        out: folder for the shards; created if it does not exist.
+        size: height and width of the images in pixels.
         voxels: resolutions of the occupancy grids, such as 32 or 32,64.
         depth: whether to write depth.
         shadows: whether shapes cast shadows on themselves.
-        seed: decides shapes, lights and views.
+        seed: of shapes, lights and views.
         per_shard: shapes in a shard.
-        jobs: worker processes; -1 takes all cores.
-        cluster: address of a Dask scheduler whose workers see the same folders; by default this machine works alone.
+        jobs: worker processes; -1 uses all cores.
+        cluster: address of a Dask scheduler with workers that have access to the same folders; by default only this
+            machine is used.
         on_error: what to do with a mesh that cannot be used.
-        overwrite: whether to make shards again that were made with other settings.
+        overwrite: whether to replace shards that were made with other settings.
     """
     import time
 
@@ -53,7 +54,7 @@ def render(
     from lsmgeo.errors import OptionError
 
     if not re.fullmatch(r"[0-9]+(,[0-9]+)*", voxels):
-        raise OptionError(f"render: voxels must be whole numbers with commas between, such as 32,64; got {voxels!r}")
+        raise OptionError(f"render: voxels must be whole numbers separated by commas, such as 32,64; got {voxels!r}")
     sides = tuple(int(side[:6]) for side in voxels.split(","))
     start = time.perf_counter()
     with ExitStack() as stack:
@@ -80,7 +81,7 @@ def render(
 
 
 def _join(address: str, stack: ExitStack) -> None:
-    """Hand the work of joblib to a Dask cluster."""
+    """Run joblib on a Dask cluster."""
     from lsmgeo.errors import OptionError
 
     try:

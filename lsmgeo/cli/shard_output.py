@@ -1,4 +1,4 @@
-"""What `render` and `convert` print of the shards that they made, and how many processes they take."""
+"""The output of `render` and `convert` on their shards, and their number of processes."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ MOST_SKIPPED = 5
 
 
 def count_jobs(jobs: int) -> int:
-    """All cores where joblib is there to let them work, else one."""
+    """The number of processes: one instead of all cores if joblib is not installed."""
     from importlib.util import find_spec
 
     if jobs == -1 and not find_spec("joblib"):
-        print("lsmgeo: one process works; joblib (of the extra data) lets all cores work", file=sys.stderr)
+        print("lsmgeo: one process works; install joblib (of the extra data) to use all cores", file=sys.stderr)
         return 1
     return jobs
 
 
 def print_shards(shards: Sequence[Path], kept: int, out: str) -> None:
-    """Print how many shards there are, where, and how many were there before."""
+    """Print the number of shards, their folder, and the number that existed before."""
     megabytes = sum(path.stat().st_size for path in shards) / 1e6
-    print(f"shards:   {len(shards)} in {Path(out).resolve()}, {megabytes:.0f} MB; {kept} were there already")
+    print(f"shards:   {len(shards)} in {Path(out).resolve()}, {megabytes:.0f} MB; {kept} existed already")
 
 
 def print_skipped(skipped: Sequence[tuple[str, str]], what: str) -> None:
-    """Print how many of ``what`` were left out, and why."""
+    """Print the number of ``what`` that were left out, and the reasons."""
     if skipped:
         print(f"skipped:  {len(skipped)} {what} that cannot be used")
         for path, reason in skipped[:MOST_SKIPPED]:

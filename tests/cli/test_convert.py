@@ -20,16 +20,16 @@ def test_a_model_is_converted(scene, tmp_path, capsys, form):
     read = data.open(out)
     assert (read.source, len(read)) == (form, 5)
     printed = capsys.readouterr().out
-    assert "scene:       5 photographs, colmap\n" in printed
+    assert "scene:       5 images, colmap\n" in printed
     assert f"written:     {form} in {out.resolve()}\n" in printed
     assert ("left out:    points" in printed) == (form != "colmap")
-    assert "straight:" not in printed
+    assert "undistorted:" not in printed
 
 
 def test_distortion_is_said_to_be_gone(scene, tmp_path, capsys):
     write_transforms(scene, tmp_path / "source", lambda values: values.update(k1=-0.2))
     assert cli.main(["convert", str(tmp_path / "source"), "--out", str(tmp_path / "out")]) == 0
-    assert "straight:    5 photographs had distortion" in capsys.readouterr().out
+    assert "undistorted: 5 images had lens distortion" in capsys.readouterr().out
     assert data.open(tmp_path / "out").lenses is None
 
 

@@ -21,7 +21,7 @@ def test_the_demo_recovers_the_depth_and_draws_it(tmp_path, capsys):
     assert 0 < float(printed["median relative depth error"].strip(" %")) <= 1.0
     assert float(printed["pixels within 1 %"].strip(" %")) >= 70
     path = tmp_path / "new" / "demo.png"
-    assert printed["picture"].strip() == str(path.resolve())
+    assert printed["figure"].strip() == str(path.resolve())
     assert [file.name for file in path.parent.iterdir()] == ["demo.png"]
     with Image.open(path) as opened:
         picture = np.array(opened)

@@ -73,7 +73,7 @@ def silhouettes(
     if found is None:
         raise OptionError(
             f"{who}: the images have no alpha, and there is no folder named {', '.join(FOLDERS)} beside them; "
-            "give a folder of masks, or the colour of the background"
+            "name a folder of masks, or give the colour of the background"
         )
     return [_from_file(scene, view, found) for view in chosen]
 

@@ -79,11 +79,7 @@ class Shapes:
         return len(self.indices)
 
     def at(self, size: int) -> Shapes:
-        """The same shapes at another size.
-
-        Args:
-            size: height and width.
-        """
+        """The same shapes with images of another height and width."""
         return replace(self, size=size)
 
     def read(self, index: int, views: int, *, resolution: int | None, depth: bool, background: Background) -> Sample:
@@ -179,17 +175,7 @@ def batches(
     background: Background = "white",
     progress: bool = False,
 ) -> Iterator[Batch]:
-    """All shapes in batches, with a progress bar.
-
-    Args:
-        shapes: from `open_shapes`.
-        views: of each shape.
-        batch: shapes at a time.
-        resolution: voxels along a side of the true occupancy; None to leave it out.
-        depth: whether to read depth.
-        background: the background of the objects.
-        progress: whether to show the bar (on a terminal).
-    """
+    """All shapes in batches of ``batch``, read as `Shapes.read` does, with a progress bar on a terminal."""
     from tqdm import tqdm
 
     with tqdm(total=len(shapes), desc="evaluating", unit="shape", disable=None if progress else True) as bar:

@@ -198,14 +198,7 @@ def open_methods(checkpoints: str, device: str | torch.device = "cpu") -> list[M
 
 
 def read_training(about: Mapping[str, Any]) -> Training:
-    """How a model was trained.
-
-    Args:
-        about: the notes in its file; ``training`` is the configuration of its run.
-
-    Returns:
-        The usual training where the notes do not say.
-    """
+    """How a model was trained, from the notes in its file; the usual training if they do not say."""
     training = about.get("training")
     data = training.get("data") if isinstance(training, Mapping) else None
     if not isinstance(data, Mapping):
@@ -214,11 +207,8 @@ def read_training(about: Mapping[str, Any]) -> Training:
     if categories != "all" and not (isinstance(categories, str) and categories in CLASS_SPLITS):
         categories = (categories,) if isinstance(categories, str) else tuple(map(str, categories))
     background = data.get("background", "white")
-    return Training(
-        categories,
-        background if isinstance(background, str) else "colour",
-        float(data.get("pose_noise", 0.0)),
-    )
+    background = background if isinstance(background, str) else "colour"
+    return Training(categories, background, float(data.get("pose_noise", 0.0)))
 
 
 def shared(methods: Sequence[Method], attribute: str) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 from torch import Tensor
 
 from lsmgeo.data import write_atomic, write_point_cloud
-from lsmgeo.metrics import CategoryMeans, category_means, voxel_iou
+from lsmgeo.metrics import category_means, voxel_iou
 
 __all__ = [
     "Cell",
@@ -220,13 +220,7 @@ class Scores:
     values: list[list[float]] = field(default_factory=list)
 
     def add(self, names: Iterable[str], categories: Iterable[str | None], values: Tensor) -> None:
-        """Add shapes.
-
-        Args:
-            names: B names.
-            categories: B names, or None.
-            values: (B, K).
-        """
+        """Add B shapes with their categories, if any, and their values (B, K)."""
         self.names += names
         self.categories += [category or "all" for category in categories]
         self.values += values.double().tolist()
@@ -235,10 +229,6 @@ class Scores:
         """The numbers under one condition."""
         return [numbers[place] for numbers in self.values]
 
-    def means(self, place: int) -> CategoryMeans:
-        """The means under one condition, of each category and of all."""
-        return category_means(self.column(place), self.categories)
-
     def cells(self, factor: float = 1.0) -> list[Cell]:
         """The mean over categories with its standard error, under every condition."""
         conditions = range(len(self.values[0]) if self.values else 0)
@@ -246,8 +236,8 @@ class Scores:
 
     def category_cells(self, place: int, categories: Sequence[str], factor: float = 1.0) -> list[Cell]:
         """The means of some categories and, last, of all, under one condition."""
-        means = self.means(place)
-        cells = [Cell(factor * means.categories.get(name, math.nan)) for name in categories]
+        means = category_means(self.column(place), self.categories).categories
+        cells = [Cell(factor * means.get(name, math.nan)) for name in categories]
         return [*cells, means_of(self.column(place), self.categories, factor)]
 
     def by_shape(self, key: str) -> list[dict[str, Any]]:
@@ -307,10 +297,6 @@ def joined(scores: Mapping[str, Scores], key: str) -> list[dict[str, Any]]:
     """The measures of every shape by method, for JSON."""
     first = next(iter(scores.values()))
     return [
-        {
-            "name": name,
-            "category": category,
-            key: {method: one.values[place] for method, one in scores.items()},
-        }
+        {"name": name, "category": category, key: {method: one.values[place] for method, one in scores.items()}}
         for place, (name, category) in enumerate(zip(first.names, first.categories, strict=True))
     ]

@@ -71,10 +71,8 @@ def report_clouds(methods: Sequence[Method], shapes: Shapes, views: int, options
         )
     ]
     facts = {"views": counts, "planes": options.planes, "window": options.window, "size": size}
-    by_shape = [
-        dict(zip(("name", "method", "views", "mean depth error", "f_score"), numbers, strict=True))
-        for numbers in measured
-    ]
+    keys = ("name", "method", "views", "mean depth error", "f_score")
+    by_shape = [dict(zip(keys, numbers, strict=True)) for numbers in measured]
     return Report("clouds", tables, facts, by_shape, figures, clouds)
 
 

@@ -38,13 +38,8 @@ def report_iou(methods: Sequence[Method], shapes: Shapes, views: int, options: O
     figure = draw_curves(
         curves, title="Voxel IoU by number of views", data=shapes.about, across="views", up="mean IoU of categories [%]"
     )
-    return Report(
-        "iou",
-        [table, *classes],
-        {"views": views, "threshold": options.threshold},
-        joined(scores, "iou"),
-        {"iou": figure},
-    )
+    facts = {"views": views, "threshold": options.threshold}
+    return Report("iou", [table, *classes], facts, joined(scores, "iou"), {"iou": figure})
 
 
 def measure_iou(

@@ -60,15 +60,8 @@ def report_order(methods: Sequence[Method], shapes: Shapes, views: int, options:
         cells = {count: scores[method.name, count].cells(100) for count in counts}
         means = {count: [cell.value for cell in every_order[method.name, count].cells(100)] for count in counts}
         rows = [Row(f"{count} views", [*cells[count], Cell(max(means[count]) - min(means[count]))]) for count in counts]
-        tables.append(
-            Table(
-                f"order of {method.name}",
-                f"{method.name}, {options.orders} orders",
-                (*MEASURES, OF_THE_SET),
-                rows,
-                2,
-            )
-        )
+        title = f"{method.name}, {options.orders} orders"
+        tables.append(Table(f"order of {method.name}", title, (*MEASURES, OF_THE_SET), rows, 2))
         bars = [Cell(cells[count][0].value, cells[count][1].value / 2) for count in counts]  # drawn twice as long
         curves.append(Curve(method.name, counts, bars))
     return Report(

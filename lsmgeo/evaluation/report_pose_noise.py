@@ -65,16 +65,6 @@ def report_pose_noise(methods: Sequence[Method], shapes: Shapes, views: int, opt
 
 
 def with_noise(batch: Batch, degrees: float, seed: int) -> CameraTensors:
-    """The cameras of a batch, rotated by noise that is different for each shape.
-
-    Args:
-        batch: the shapes.
-        degrees: largest angle.
-        seed: of the noise.
-    """
-    return stack(
-        [
-            perturb(batch.cameras.at(place), degrees, generator=noise_of(seed, name))
-            for place, name in enumerate(batch.name)
-        ]
-    )
+    """The cameras of a batch, rotated by up to ``degrees`` by noise that is different for each shape."""
+    generators = [noise_of(seed, name) for name in batch.name]
+    return stack([perturb(batch.cameras.at(k), degrees, generator=each) for k, each in enumerate(generators)])

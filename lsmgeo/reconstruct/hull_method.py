@@ -50,19 +50,7 @@ def hull_results(
 ) -> Results:
     """Carve the visual hull of all silhouettes and colour its surface.
 
-    Args:
-        scene: posed images.
-        view: the view to start from in the page; None for the first.
-        title: of the page and the figures.
-        rule: "all" for a solid within every silhouette, "mean" within three quarters of them, which tolerates wrong
-            silhouettes; see `lsmgeo.classical.visual_hull`.
-        masks: folder of mask files, see `lsmgeo.classical.silhouettes`.
-        background: the colour of the background: "black", "white", or three numbers from 0 to 1, separated by commas.
-        resolution: voxels along the longest side of the box of the hull.
-        size: longer side of the silhouettes in pixels; never larger than that of the images.
-
-    Returns:
-        `Results`; depth is where a ray first meets the hull, confidence is the silhouette.
+    Depth is where a ray first meets the hull, confidence is the silhouette.
 
     Raises:
         OptionError: there are no silhouettes, one is empty, or nothing projects into all of them.

@@ -143,21 +143,7 @@ def learnt_results(
     resolution: int = 192,
     size: int = 640,
 ) -> Results:
-    """Reconstruct a scene with a learnt model.
-
-    Args:
-        scene: posed images.
-        view: the view to start from, in the page and as the first input; None for the first usable one.
-        title: of the page and the figures.
-        method: "v-lsm", voxels and their surface; or "d-lsm", depth maps, points and the surface that they fuse to.
-        weights: a file of `lsmgeo.models.write_weights`, a checkpoint or a run folder.
-        views: see `predict_scene`, like box, masks and background.
-        box: four numbers, separated by commas.
-        threshold: probability from which a voxel is solid, for "v-lsm".
-        masks: see `predict_scene`.
-        background: "black", "white", or three numbers from 0 to 1, separated by commas.
-        resolution: the largest number of voxels along a side of the cube in which the surface is made.
-        size: longer side in pixels of the images in which voxels are shown.
+    """Reconstruct a scene with a learnt model: "v-lsm" for voxels and their surface, "d-lsm" for fused depth maps.
 
     Raises:
         OptionError: no weights, or weights of another model; an option out of range; the position of the object cannot

@@ -39,15 +39,7 @@ def sweep_results(
     resolution: int,
     **options: Any,
 ) -> Results:
-    """Plane-sweep stereo of one view, or of all that can be swept.
-
-    Args:
-        scene: posed images.
-        view: the view to sweep; None for all.
-        title: of the page and the figures.
-        check: the number of neighbours of one view that are swept too; all of them must agree with it.
-        resolution: voxels along the longest side of the box of the mesh.
-        options: the fields of `SweepOptions`.
+    """Plane-sweep stereo of one view, or of all that can be swept; ``options`` are the fields of `SweepOptions`.
 
     Raises:
         OptionError: an option out of range, or no view can be swept.

@@ -1,4 +1,4 @@
-"""Checks of arguments that every public function shares; each names what was expected and what came."""
+"""Checks of arguments, shared by all public functions; each names what was expected and what was received."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ LARGEST = sys.float_info.max
 
 
 def describe(value: Any) -> str:
-    """What a value is, in few words, for an error message."""
+    """A short description of a value for an error message."""
     if isinstance(value, Tensor):
         return f"a tensor {tuple(value.shape)} of {value.dtype}"
     if hasattr(value, "shape") and hasattr(value, "dtype"):
@@ -74,16 +74,16 @@ def check_geometry(
     rank: int | None = None,
     dtypes: Sequence[torch.dtype] = GEOMETRY,
 ) -> None:
-    """Require a float32 or float64 tensor of no absurd size: cameras, poses, depths, points."""
+    """Require a float32 or float64 tensor of at most 2^31 - 1 numbers: cameras, poses, depths, points."""
     check_float(who, name, value, expected, rank, dtypes)
     if value.numel() > LARGEST_COUNT:
         raise ShapeError(f"{who}: {name} must be {expected}, 2^31 - 1 numbers at most; got {tuple(value.shape)}")
 
 
-def check_finite(who: str, name: str, value: Tensor) -> None:
+def check_finite(who: str, name: str, value: Tensor, error: type[Exception] = OptionError) -> None:
     """Require a tensor without NaNs and infinities."""
     if not bool(value.isfinite().all()):
-        raise OptionError(f"{who}: {name} must be finite; got a NaN or an infinity")
+        raise error(f"{who}: {name} must be finite; got a NaN or an infinity")
 
 
 def check_mask(who: str, name: str, value: Any, shape: tuple[int, ...], expected: str) -> None:
@@ -102,7 +102,7 @@ def check_choice(who: str, name: str, value: Any, choices: Sequence[str]) -> str
 
 
 def check_choices(who: str, name: str, value: Any, choices: Sequence[str]) -> tuple[str, ...]:
-    """Require a name, or an iterable of different names, out of the options; return a tuple."""
+    """Require one or an iterable of different named options; return a tuple."""
     if isinstance(value, str):
         value = (value,)
     if not isinstance(value, Iterable) or isinstance(value, Tensor):
@@ -121,7 +121,7 @@ def check_flag(who: str, name: str, value: Any) -> bool:
 
 
 def check_broadcast(who: str, **shapes: Sequence[int]) -> tuple[int, ...]:
-    """Require leading shapes that broadcast, and return the one that comes of it."""
+    """Require leading shapes that broadcast, and return their common shape."""
     common: list[int] = []
     for sizes in zip_longest(*(reversed(shape) for shape in shapes.values()), fillvalue=1):
         others = [size for size in sizes if size != 1]
@@ -152,7 +152,7 @@ def check_number(
 
 
 def is_whole(value: Any) -> TypeGuard[int]:
-    """Whether a value is a whole number, Python's or numpy's; True and False are none."""
+    """Whether a value is an integer, Python's or numpy's, and not a boolean."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
@@ -162,7 +162,7 @@ def check_positive(who: str, name: str, value: Any) -> float:
 
 
 def check_whole(who: str, name: str, value: Any, least: int, most: int = 2**63 - 1) -> int:
-    """Require a whole number (see `is_whole`) in a range; return Python's."""
+    """Require a whole number (see `is_whole`) in a range; return a Python int."""
     if not is_whole(value) or not least <= value <= most:
         expected = (
             f"a whole number, at least {least}" if most == 2**63 - 1 else f"a whole number from {least} to {most}"
@@ -174,7 +174,7 @@ def check_whole(who: str, name: str, value: Any, least: int, most: int = 2**63 -
 def check_size(
     who: str, name: str, value: Any, length: int, expected: str, error: type[Exception] = ShapeError
 ) -> tuple[int, ...]:
-    """Require that many positive integers (an int alone stands for all of them where `length` is 3)."""
+    """Require `length` positive integers; if `length` is 3, one int may be given for all."""
     if is_whole(value) and length == 3:
         value = (value,) * 3
     if (
@@ -193,7 +193,7 @@ def check_size(
 
 
 def check_devices(who: str, **tensors: Tensor | None) -> None:
-    """Require that all tensors given are on one device."""
+    """Require all tensors on one device; None is skipped."""
     given = {name: tensor.device for name, tensor in tensors.items() if tensor is not None}
     if len(set(given.values())) > 1:
         places = ", ".join(f"{name} on {device}" for name, device in given.items())
@@ -201,7 +201,7 @@ def check_devices(who: str, **tensors: Tensor | None) -> None:
 
 
 def moved(who: str, name: str, tensor: Tensor, device: torch.device) -> Tensor:
-    """A tensor on another device; one on the meta device holds nothing to move."""
+    """Move a tensor to a device; one on the meta device has no values to move."""
     if tensor.is_meta and device.type != "meta":
         raise DeviceError(f"{who}: {name} must hold values; got a tensor on the meta device")
     return tensor.to(device)

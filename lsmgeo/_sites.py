@@ -10,11 +10,11 @@ from math import prod
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_devices, check_float, check_mask, check_size, describe
+from lsmgeo._checks import check_devices, check_float, describe
 from lsmgeo._linalg import affine_inverse, multiply
-from lsmgeo.cameras.camera_checks import check_cameras, common_size, views_of, views_per_scene
+from lsmgeo.cameras.camera_checks import check_views, image_size, views_per_scene
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
-from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors
+from lsmgeo.cameras.tensors import Cameras, as_tensors
 from lsmgeo.errors import DTypeError, ShapeError
 from lsmgeo.grids import FrustumGrid, Lattice, VoxelGrid, check_depths
 from lsmgeo.kernels.request import Options, Sites
@@ -39,23 +39,11 @@ def check_features(who: str, features: Tensor, count: int | None = None) -> tupl
     return B, V
 
 
-def _views(
-    who: str, cameras: CameraTensors, views: tuple[int, int], view_mask: Tensor | None, **tensors: Tensor
-) -> CameraTensors:
-    """Bring cameras to leading shape (B, V) and check them."""
-    cameras = views_of(who, cameras, views)
-    if view_mask is not None:
-        check_mask(who, "view_mask", view_mask, views, "(B, V)")
-    check_devices(who, **tensors, cameras=cameras.intrinsics, view_mask=view_mask)
-    check_cameras(who, cameras, view_mask)
-    return cameras
-
-
 def image_matrices(who: str, features: Tensor, cameras: Cameras, view_mask: Tensor | None) -> CameraMatrices:
     """The cameras (B, V) of a feature map, checked, K resized to it."""
     tensors = as_tensors(cameras, who)
-    views = check_features(who, features, prod(tensors.cam_from_world.shape[:-2]))
-    tensors = _views(who, tensors, views, view_mask, features=features)
+    views = check_features(who, features, prod(tensors.shape))
+    tensors = check_views(who, tensors, views, view_mask, features=features)
     return camera_matrices(tensors, (features.shape[3], features.shape[4]), view_mask)
 
 
@@ -121,15 +109,14 @@ def sweep_sites(
     tensors = as_tensors(cameras, who)
     views = views_per_scene(who, tensors, volume.shape[0], "volume's")
     lattice = _lattice(who, grid, volume)
-    tensors = _views(who, tensors, views, view_mask, volume=volume)
+    tensors = check_views(who, tensors, views, view_mask, volume=volume)
     check_depths(who, depths, "(P,), (B, P) or (B, V, P)", view_mask)
     if depths.dim() > 1 and tuple(depths.shape[:-1]) != views[: depths.dim() - 1]:
         raise ShapeError(
             f"{who}: depths must be (P,), (B, P) or (B, V, P) with (B, V) = {views}; got {tuple(depths.shape)}"
         )
     check_devices(who, volume=volume, depths=depths)
-    size = common_size(who, tensors) if size is None else check_size(who, "size", size, 2, "(h, w)")  # type: ignore[assignment]
-    assert size is not None
+    size = image_size(who, tensors, size)
     matrices = camera_matrices(tensors, size, view_mask)
     frustum = matrices.world_from_frustum()
     inverse = affine_inverse(lattice.world_from_lattice)[..., :3, :]

@@ -18,11 +18,11 @@ _debug: ContextVar[bool] = ContextVar("lsmgeo_debug", default=False)
 
 @contextmanager
 def debug() -> Iterator[None]:
-    """Check the values of every argument while the context is open, also where that makes a GPU wait.
+    """Check the values of all arguments within this context, also on a GPU, which then has to synchronise.
 
-    Values (finite, rigid, ordered) of tensors on the CPU are always checked in eager mode; inside this context those
-    on other devices are too. Nothing is checked under ``torch.compile``, ``torch.export`` and ``torch.func``, where
-    values cannot be read.
+    In eager mode, values (finite, rigid, ordered) of CPU tensors are always checked; within this context, those on
+    other devices are too. Under ``torch.compile``, ``torch.export`` and ``torch.func`` values cannot be read, and are
+    not checked.
 
     Example:
         >>> import torch, lsmgeo
@@ -39,13 +39,13 @@ def debug() -> Iterator[None]:
 
 
 def is_traced() -> bool:
-    """Whether the running code is being traced or transformed, so that no value may steer it."""
+    """Whether the code is being traced or transformed, so that control flow must not depend on values."""
     return torch.compiler.is_compiling() or has_function_transforms()
 
 
 def can_inspect(*tensors: torch.Tensor) -> bool:
-    """Whether the values of these tensors may be read without a GPU waiting or a trace breaking."""
-    # Tensors without values of their own (meta, fake, distributed) cannot be read.
+    """Whether the values of these tensors may be read without synchronising a GPU or breaking a trace."""
+    # Tensors without values (meta, fake, distributed) cannot be read.
     if is_traced() or any(tensor.is_meta or type(tensor) not in PLAIN for tensor in tensors):
         return False
     return _debug.get() or all(tensor.device.type == "cpu" for tensor in tensors)

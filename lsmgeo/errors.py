@@ -36,19 +36,19 @@ class DeviceError(LsmGeoError, ValueError):
 
 
 class CameraError(LsmGeoError, ValueError):
-    """A camera is not a rigid pinhole camera: a singular calibration matrix, a mirrored rotation, and the like."""
+    """A camera is not a rigid pinhole camera: for example a singular calibration matrix or a mirrored rotation."""
 
 
 class GridError(LsmGeoError, ValueError):
-    """A grid is impossible: no voxels, crossed bounds, depths out of order."""
+    """A grid is invalid: no voxels, crossed bounds, depths out of order."""
 
 
 class OptionError(LsmGeoError, ValueError):
-    """An option has a value that the operator does not know."""
+    """An option has an invalid value."""
 
 
 class BackendError(LsmGeoError, ValueError):
-    """A backend was asked for by name and cannot run this call."""
+    """A backend requested by name cannot run this call."""
 
 
 class _FileError(LsmGeoError):
@@ -58,12 +58,12 @@ class _FileError(LsmGeoError):
         self.reason = reason
 
     def __reduce__(self) -> tuple[type[_FileError], tuple[str | PathLike[str], str]]:
-        # The default rebuilds an error from its one message, and a pool of processes that meets this breaks.
+        # By default pickle rebuilds an error from its message only, which breaks a pool of processes.
         return type(self), (self.path, self.reason)
 
 
 class DataError(_FileError, OSError):
-    """A file from outside cannot be used.
+    """An input file cannot be used.
 
     Args:
         path: the file or folder.
@@ -81,4 +81,4 @@ class CheckpointError(_FileError, RuntimeError):
 
 
 class TrainingError(LsmGeoError, RuntimeError):
-    """Training cannot go on: its numbers are not finite, or its processes do not agree."""
+    """Training cannot continue: values are not finite, or its processes do not agree."""

@@ -2,7 +2,7 @@
 
 A lattice is a regular array of sites with homogeneous index ``q = (x[i], y[j], z[k], 1)`` and homogeneous world
 position ``X ~ T q``. `VoxelGrid` counts x, y, z = 0, 1, 2, ... with T affine; `FrustumGrid` has ``z[k] = 1 / depth[k]``
-and T projective. Nothing else distinguishes them.
+and T projective. They differ in nothing else.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from lsmgeo._checks import (
 )
 from lsmgeo._linalg import affine_inverse, basis_row, homogeneous_row, inverse_3x3, multiply
 from lsmgeo._torch_compat import is_exporting
-from lsmgeo.cameras.camera_checks import check_cameras, common_size
+from lsmgeo.cameras.camera_checks import check_cameras, image_size
 from lsmgeo.cameras.matrices import camera_matrices
 from lsmgeo.cameras.tensors import Cameras, as_tensors
 from lsmgeo.debugging import can_inspect
@@ -36,7 +36,7 @@ from lsmgeo.errors import DTypeError, GridError, ShapeError
 __all__ = ["FrustumGrid", "Lattice", "VoxelGrid", "depth_planes"]
 
 
-# Far from what float32 holds.
+# Far below the largest float32.
 LARGEST_BOUND = 1e37
 LARGEST_NUMBER_OF_PLANES = 2**20
 
@@ -63,7 +63,7 @@ class Lattice(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class VoxelGrid:
-    """A box of voxels: an immutable value, no module; it follows the features' device and is never cast.
+    """A box of voxels: an immutable value, not a module; it follows the features' device and is never cast.
 
     Convention:
         Arrays over the grid are (..., D, H, W) with D along z, H along y, W along x. Voxel i of n between lower and
@@ -73,8 +73,8 @@ class VoxelGrid:
         shape: (D, H, W), or one int for all three.
         lower: lower bounds of the box in world units, a number or (x, y, z).
         upper: upper bounds of the box.
-        world_from_grid: affine (4, 4) or, one for each scene, (B, 4, 4), float32 or float64, applied to the metric box:
-            any pose and, if wanted, scale or shear. Gradients flow to it.
+        world_from_grid: affine (4, 4), or (B, 4, 4) for one per scene, float32 or float64, applied to the metric box:
+            any pose, also with scale or shear. Gradients flow to it.
 
     Raises:
         GridError: no voxels, more than 2^31 - 1, crossed or non-finite bounds, a singular or projective matrix.
@@ -124,7 +124,7 @@ class VoxelGrid:
                     raise GridError("VoxelGrid: world_from_grid must be invertible; got a singular matrix")
 
     def __repr__(self) -> str:
-        """The call that makes this grid (a matrix is shown by its shape)."""
+        """The call that creates this grid, with the shape in place of a matrix."""
         text = f"VoxelGrid({self.shape}, lower={self.lower}, upper={self.upper}"
         if self.world_from_grid is not None:
             text += f", world_from_grid=<{tuple(self.world_from_grid.shape)} {self.world_from_grid.dtype}>"
@@ -158,7 +158,7 @@ class VoxelGrid:
         return affine_inverse(self.world_from_lattice)
 
     def lattice(self, device: torch.device | None = None) -> Lattice:
-        """The grid as the operators see it, on a device or where it is."""
+        """The lattice that the operators take, on a device or on the grid's own."""
         T = self._world_from_lattice(device)
         depth, height, width = self.shape  # type: ignore[misc]
         x, y, z = (torch.arange(n, dtype=T.dtype, device=T.device) for n in (width, height, depth))
@@ -205,7 +205,7 @@ def check_depths(who: str, depths: Tensor, expected: str = "(P,) or (B, P)", vie
 
 
 def check_constant_depths(who: str, depths: Tensor) -> None:
-    """Require depths that a module may keep: no parameter, which it would take into its state."""
+    """Require depths that a module may store: not a parameter, which would become part of its state."""
     if isinstance(depths, torch.nn.Parameter):
         raise DTypeError(f"{who}: depths must be a plain tensor; got a Parameter (pass learned depths to the function)")
     check_depths(who, depths, "(P,), (B, P) or (B, V, P)")
@@ -213,13 +213,13 @@ def check_constant_depths(who: str, depths: Tensor) -> None:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FrustumGrid:
-    """The frustum of one camera a scene, cut into fronto-parallel planes: the sites of a plane-sweep volume.
+    """The frustum of one camera per scene, cut into fronto-parallel planes: the sites of a plane-sweep volume.
 
     Equation: site (k, j, i) is at the depth[k] point of the ray of pixel (i, j): ``X ~ T (i, j, 1/depth[k], 1)``,
     ``T = [[R^T K^-1[:, :2], -R^T t, R^T K^-1[:, 2:]], [0, 0, 1, 0]]``.
 
     Args:
-        camera: one camera a scene, leading shape () or (B,): a kornia ``PinholeCamera`` or `CameraTensors`.
+        camera: one camera per scene, leading shape () or (B,): a kornia ``PinholeCamera`` or `CameraTensors`.
         depths: (P,) or (B, P) camera z in world units, positive, strictly ascending; see `depth_planes`.
         size: (h, w) of the planes, for which K is resized; by default the camera's image size.
 
@@ -227,8 +227,8 @@ class FrustumGrid:
 
     Raises:
         GridError: depths out of order, too many sites.
-        ShapeError: more than one camera a scene.
-        CameraError: a camera that is no rigid pinhole camera.
+        ShapeError: more than one camera per scene.
+        CameraError: an invalid camera.
 
     Example:
         >>> from lsmgeo import FrustumGrid, depth_planes
@@ -250,7 +250,7 @@ class FrustumGrid:
         leading = camera.shape
         if len(leading) > 1:
             raise ShapeError(
-                f"{who}: camera must have leading shape () or (B,), one a scene (see cameras.select); got {leading}"
+                f"{who}: camera must have leading shape () or (B,), one per scene, see cameras.select; got {leading}"
             )
         check_cameras(who, camera)
         check_depths(who, self.depths)
@@ -259,10 +259,10 @@ class FrustumGrid:
                 f"{who}: depths must be (P,) or (B, P) with B = {leading[0]} cameras; got {tuple(self.depths.shape)}"
             )
         check_devices(who, camera=camera.intrinsics, depths=self.depths)
-        size = common_size(who, camera) if self.size is None else check_size(who, "size", self.size, 2, "(h, w)")
+        size = image_size(who, camera, self.size)
         check_size(who, "shape", (self.depths.shape[-1], *size), 3, "(P, h, w)", GridError)
         object.__setattr__(self, "camera", camera)
-        object.__setattr__(self, "size", tuple(size))
+        object.__setattr__(self, "size", size)
 
     def __repr__(self) -> str:
         """Shape and number of scenes."""
@@ -288,7 +288,7 @@ class FrustumGrid:
         return torch.cat((P[..., :2, :], basis_row(P, 4, 3), P[..., 2:, :]), -2)
 
     def lattice(self, device: torch.device | None = None) -> Lattice:
-        """The grid as the operators see it, on a device or where it is."""
+        """The lattice that the operators take, on a device or on the grid's own."""
         T = self.world_from_lattice
         T = T if device is None else moved("FrustumGrid", "camera", T, device)
         _, height, width = self.shape
@@ -304,11 +304,11 @@ def depth_planes(near: float | Tensor, far: float | Tensor, num: int, spacing: s
     """Depths of sweep planes from near to far, both ends included.
 
     Equation: with a in [0, 1] evenly spaced, "depth": near + a (far - near); "inverse":
-    1 / (1/near + a (1/far - 1/near)); "log": near (far / near)^a. "inverse" makes even steps in another view.
+    1 / (1/near + a (1/far - 1/near)); "log": near (far / near)^a. "inverse" gives even steps in another view's image.
 
     Args:
-        near: first depth, positive, world units; a number, or (B,) for depths of each scene.
-        far: last depth, larger; a number or (B,).
+        near: first depth, positive, world units; a number, or (B,) for one per scene.
+        far: last depth, larger than near; a number or (B,).
         num: number of planes, at least 1; 1 gives near.
         spacing: "depth", "inverse" or "log".
 
@@ -316,8 +316,8 @@ def depth_planes(near: float | Tensor, far: float | Tensor, num: int, spacing: s
         (num,) or (B, num), strictly ascending, differentiable in near and far.
 
     Raises:
-        GridError: no planes; near and far not positive and ascending, or with fewer numbers of their dtype between
-            them than planes.
+        GridError: no planes; near and far not positive and ascending, or too close for `num` different numbers of
+            their dtype.
         OptionError: an unknown spacing.
 
     Example:
@@ -364,10 +364,10 @@ def depth_planes(near: float | Tensor, far: float | Tensor, num: int, spacing: s
     else:
         planes = torch.exp((1.0 - a) * torch.log(first) + a * torch.log(last))
     planes = torch.cat((ends[0], planes[..., 1:-1].to(dtype), ends[1]), -1)  # the ends exactly
-    # Programs that a graph is exported to, ONNX among them, cannot look at bits.
+    # Exported programs, for example ONNX, cannot reinterpret bits.
     if torch.jit.is_tracing() or is_exporting():  # type: ignore[attr-defined]
         return planes
-    # Rounding may leave neighbours equal. Positive numbers are ordered as the integers of the same bits.
+    # Rounding may make neighbours equal. Positive floats are ordered as the integers of the same bits.
     integers = {2: torch.int16, 4: torch.int32, 8: torch.int64}[planes.element_size()]
     count = torch.arange(num, device=planes.device)
     excess = planes.detach().view(integers).long() - count

@@ -1,7 +1,7 @@
-"""Pinhole cameras: one plain form, kornia's classes in and out, and the conventions of other tools.
+"""Pinhole cameras: one plain form, conversion from and to kornia's classes, and the conventions of other tools.
 
-Only this package knows kornia's camera classes. Conventions: OpenCV axes (x right, y down, z forward), world-to-camera
-extrinsics ``X_cam = R X_world + t``, integer pixel centres.
+Only this package imports kornia's camera classes. Conventions: OpenCV axes (x right, y down, z forward), world-to-
+camera extrinsics ``X_cam = R X_world + t``, integer pixel centres.
 """
 
 from lsmgeo.cameras.converters import (

@@ -1,4 +1,4 @@
-"""Checks of cameras beside other arguments: their values, their one size, their scenes and views."""
+"""Checks of cameras: their values, their common image size, and how many scenes and views they are of."""
 
 from __future__ import annotations
 
@@ -7,12 +7,18 @@ from math import prod
 import torch
 from torch import Tensor
 
+from lsmgeo._checks import check_devices, check_mask, check_size
 from lsmgeo._linalg import multiply
 from lsmgeo.cameras.tensors import CameraTensors, image_sizes
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, ShapeError
 
-__all__ = ["check_cameras", "common_size", "views_of", "views_per_scene"]
+__all__ = ["check_cameras", "check_views", "image_size", "rotation_error", "views_of", "views_per_scene"]
+
+
+def rotation_error(R: Tensor) -> Tensor:
+    """``max |R^T R - I|`` of (..., 3, 3), (...)."""
+    return (multiply(R.transpose(-1, -2), R) - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-1, -2))
 
 
 def check_cameras(who: str, cameras: CameraTensors, view_mask: Tensor | None = None) -> None:
@@ -22,9 +28,9 @@ def check_cameras(who: str, cameras: CameraTensors, view_mask: Tensor | None = N
     extrinsics (``max |R^T R - I| <= 1e-3``, det R > 0) with last row (0, 0, 0, 1); sizes of at least one pixel.
 
     Args:
-        who: the function that asks.
+        who: the calling function, named in errors.
         cameras: from `as_tensors`.
-        view_mask: bool, of the cameras' leading shape; cameras where it is False are not looked at.
+        view_mask: bool, of the cameras' leading shape; cameras where it is False are not checked.
     """
     intrinsics, cam_from_world = cameras.intrinsics, cameras.cam_from_world
     height, width = image_sizes(cameras)
@@ -33,16 +39,14 @@ def check_cameras(who: str, cameras: CameraTensors, view_mask: Tensor | None = N
     with torch.no_grad():
         K, E = intrinsics.double(), cam_from_world.double()
         R = E[..., :3, :3]
-        residual = (
-            (multiply(R.transpose(-1, -2), R) - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-1, -2))
-        )
+        residual = rotation_error(R)
         triple = (R[..., 0, :] * torch.linalg.cross(R[..., 1, :], R[..., 2, :])).sum(-1)
         focal = torch.minimum(K[..., 0, 0], K[..., 1, 1])
         smallest = 1e-6 * torch.maximum(height, width)
         last_k = (K[..., 2, :] - K.new_tensor([0.0, 0.0, 1.0])).abs().amax(-1)
         last_e = (E[..., 3, :] - E.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax(-1)
         rules = (
-            # Written so that a NaN breaks the rule that names it first.
+            # A NaN fails the rule of its own field before the others.
             ("intrinsics must be finite", K.isfinite().all(-1).all(-1), None),
             ("cam_from_world must be finite", E.isfinite().all(-1).all(-1), None),
             ("height and width must be at least 1 pixel", (height >= 1) & (width >= 1), None),
@@ -65,11 +69,14 @@ def check_cameras(who: str, cameras: CameraTensors, view_mask: Tensor | None = N
                 raise CameraError(f"{who}: cameras{list(index) if index else ''}: {text}{came}")
 
 
-def common_size(who: str, cameras: CameraTensors) -> tuple[int, int]:
-    """The one image size (height, width) of all cameras; an error where they differ or where values cannot be read."""
+def image_size(who: str, cameras: CameraTensors, size: tuple[int, int] | None = None) -> tuple[int, int]:
+    """The checked `size` (h, w); where it is None, the size of all cameras' images, an error if there are several."""
+    if size is not None:
+        height, width = check_size(who, "size", size, 2, "(h, w)")
+        return height, width
     if torch.compiler.is_compiling():
         raise CameraError(f"{who}: size must be given under torch.compile and torch.export; got None")
-    heights, widths = (size.unique().tolist() for size in image_sizes(cameras))
+    heights, widths = (side.unique().tolist() for side in image_sizes(cameras))
     if len(heights) != 1 or len(widths) != 1:
         raise CameraError(
             f"{who}: size must be given where views differ in size; got heights {heights}, widths {widths}"
@@ -96,7 +103,7 @@ def views_per_scene(who: str, cameras: CameraTensors, scenes: int, whose: str) -
         else:
             views = (scenes, count // scenes)
     if views[1] < 1:
-        raise ShapeError(f"{who}: cameras must hold at least one view a scene; got none")
+        raise ShapeError(f"{who}: cameras must hold at least one view per scene; got none")
     return views
 
 
@@ -112,3 +119,15 @@ def views_of(who: str, cameras: CameraTensors, views: tuple[int, int]) -> Camera
     height, width = (size.reshape(views) for size in image_sizes(cameras))
     matrices = (cameras.intrinsics.reshape(*views, 3, 3), cameras.cam_from_world.reshape(*views, 4, 4))
     return CameraTensors(*matrices, height, width)
+
+
+def check_views(
+    who: str, cameras: CameraTensors, views: tuple[int, int], view_mask: Tensor | None = None, **tensors: Tensor
+) -> CameraTensors:
+    """Cameras with leading shape (B, V), see `views_of`, checked and on the device of the mask and other tensors."""
+    cameras = views_of(who, cameras, views)
+    if view_mask is not None:
+        check_mask(who, "view_mask", view_mask, views, "(B, V)")
+    check_devices(who, **tensors, cameras=cameras.intrinsics, view_mask=view_mask)
+    check_cameras(who, cameras, view_mask)
+    return cameras

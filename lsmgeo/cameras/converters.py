@@ -1,7 +1,7 @@
-"""Cameras of other tools, in and out, with the half pixel where it belongs.
+"""Cameras from and to other tools, with the half-pixel shift of their principal points.
 
-Tools differ in three ways: the direction of the extrinsics, the camera's axes, and where the centre of the first pixel
-is. Ours: world-to-camera, x right, y down, z forward, and centre (0, 0) ("integer"). Tools that put it at (0.5, 0.5)
+Tools differ in the direction of the extrinsics, the camera's axes, and the centre of the first pixel. Here: world-to-
+camera, x right, y down, z forward, and (0, 0) ("integer"). Tools that put the first pixel's centre at (0.5, 0.5)
 ("half") report principal points half a pixel larger.
 """
 
@@ -18,8 +18,9 @@ from kornia.geometry.conversions import (
 from torch import Tensor
 
 from lsmgeo._checks import check_broadcast, check_choice, check_devices, check_flag, check_geometry, check_size
-from lsmgeo._linalg import homogeneous_row, multiply, transform
-from lsmgeo.cameras.camera_checks import check_cameras
+from lsmgeo._linalg import homogeneous_row, transform
+from lsmgeo.cameras.camera_checks import check_cameras, rotation_error
+from lsmgeo.cameras.matrices import pinhole_matrix
 from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, ShapeError
@@ -88,7 +89,7 @@ def _shifted(intrinsics: Tensor, pixels: float) -> Tensor:
     return intrinsics + shift
 
 
-def _made(who: str, K: Tensor, R: Tensor, t: Tensor, height: Size, width: Size, pixel_center: str) -> CameraTensors:
+def _join(who: str, K: Tensor, R: Tensor, t: Tensor, height: Size, width: Size, pixel_center: str) -> CameraTensors:
     check_choice(who, "pixel_center", pixel_center, PIXEL_CENTERS)
     if pixel_center == "half":
         K = _shifted(K, -0.5)
@@ -100,7 +101,7 @@ def _made(who: str, K: Tensor, R: Tensor, t: Tensor, height: Size, width: Size, 
     return cameras
 
 
-def _taken(who: str, cameras: Cameras, pixel_center: str) -> tuple[Tensor, Tensor, Tensor]:
+def _split(who: str, cameras: Cameras, pixel_center: str) -> tuple[Tensor, Tensor, Tensor]:
     check_choice(who, "pixel_center", pixel_center, PIXEL_CENTERS)
     tensors = as_tensors(cameras, who)
     check_cameras(who, tensors)
@@ -117,12 +118,12 @@ def from_opencv(
     *,
     pixel_center: str = "integer",
 ) -> CameraTensors:
-    """Cameras of OpenCV's calibration functions: ``x ~ K (R X + t)``, the axes and pixel centres are ours.
+    """Cameras of OpenCV's calibration functions: ``x ~ K (R X + t)``, with the same axes and pixel centres.
 
     Args:
         intrinsics: (..., 3, 3) in pixels.
-        rotation: (..., 3, 3) matrices, or (..., 3) axis-angle vectors (``rvec``, radians). What ends in (3, 3) is taken
-            for vectors where it has the translation's shape, as three pairs of rvec and tvec have, else for matrices.
+        rotation: (..., 3, 3) matrices, or (..., 3) axis-angle vectors (``rvec``, radians). A shape that ends in (3, 3)
+            means vectors if the translation has the same shape (three pairs of rvec and tvec), else matrices.
         translation: (..., 3), world units.
         height: image height in pixels, an int or (...).
         width: image width in pixels, an int or (...).
@@ -148,10 +149,7 @@ def from_opencv(
     t = _matrix(who, "translation", translation, 3)
     looks_like_matrices = tuple(rotation.shape[-2:]) == (3, 3)
     if looks_like_matrices and rotation.shape == t.shape and can_inspect(rotation):
-        turned = multiply(rotation, rotation.transpose(-1, -2)) - torch.eye(
-            3, dtype=rotation.dtype, device=rotation.device
-        )
-        if bool((turned.abs() <= 1e-3).all()):
+        if bool((rotation_error(rotation) <= 1e-3).all()):
             raise CameraError(
                 f"{who}: rotation must not be three vectors and a matrix at once; expand matrices to the translation's "
                 f"leading shape; got {tuple(rotation.shape)} and {tuple(t.shape)}"
@@ -161,7 +159,7 @@ def from_opencv(
     else:
         vectors = _matrix(who, "rotation", rotation, 3)
         R = axis_angle_to_rotation_matrix(vectors.reshape(-1, 3)).reshape(*vectors.shape[:-1], 3, 3)
-    return _made(who, K, R, t, height, width, pixel_center)
+    return _join(who, K, R, t, height, width, pixel_center)
 
 
 def to_opencv(cameras: Cameras, *, pixel_center: str = "integer") -> OpenCVCameras:
@@ -169,7 +167,7 @@ def to_opencv(cameras: Cameras, *, pixel_center: str = "integer") -> OpenCVCamer
 
     Args:
         cameras: leading shape (...).
-        pixel_center: "integer" or "half", of the intrinsics returned.
+        pixel_center: "integer" or "half", of the returned intrinsics.
 
     Returns:
         `OpenCVCameras`.
@@ -179,7 +177,7 @@ def to_opencv(cameras: Cameras, *, pixel_center: str = "integer") -> OpenCVCamer
         >>> to_opencv(orbit(0.0, 0.0, 2.0, focal_length=50.0, height=48, width=64)).translation
         tensor([0., 0., 2.])
     """
-    return OpenCVCameras(*_taken("to_opencv", cameras, pixel_center))
+    return OpenCVCameras(*_split("to_opencv", cameras, pixel_center))
 
 
 def from_opengl(
@@ -215,7 +213,7 @@ def from_opengl(
     pose = _matrix(who, "world_from_cam", world_from_cam, 4, 4)
     flip = pose.new_tensor([1.0, -1.0, -1.0])
     R = flip[:, None] * pose[..., :3, :3].transpose(-1, -2) + 0.0
-    return _made(who, K, R, 0.0 - transform(R, pose[..., :3, 3]), height, width, pixel_center)
+    return _join(who, K, R, 0.0 - transform(R, pose[..., :3, 3]), height, width, pixel_center)
 
 
 def to_opengl(cameras: Cameras, *, pixel_center: str = "half") -> OpenGLCameras:
@@ -223,7 +221,7 @@ def to_opengl(cameras: Cameras, *, pixel_center: str = "half") -> OpenGLCameras:
 
     Args:
         cameras: leading shape (...).
-        pixel_center: "half" or "integer", of the intrinsics returned.
+        pixel_center: "half" or "integer", of the returned intrinsics.
 
     Returns:
         `OpenGLCameras`.
@@ -233,7 +231,7 @@ def to_opengl(cameras: Cameras, *, pixel_center: str = "half") -> OpenGLCameras:
         >>> to_opengl(orbit(0.0, 0.0, 2.0, focal_length=50.0, height=48, width=64)).world_from_cam[:3, 3]
         tensor([2., 0., 0.])
     """
-    K, R, t = _taken("to_opengl", cameras, pixel_center)
+    K, R, t = _split("to_opengl", cameras, pixel_center)
     inverse = R.transpose(-1, -2)
     center = 0.0 - transform(inverse, t)
     flip = R.new_tensor([1.0, -1.0, -1.0])
@@ -249,11 +247,11 @@ def from_colmap(
     *,
     pixel_center: str = "half",
 ) -> CameraTensors:
-    """Cameras of a COLMAP model: world-to-camera quaternions, our axes, half-integer pixel centres.
+    """Cameras of a COLMAP model: world-to-camera quaternions, axes as here, half-integer pixel centres.
 
     Args:
         intrinsics: (..., 3, 3) in pixels, from PINHOLE (fx, fy, cx, cy) or SIMPLE_PINHOLE (f, cx, cy) parameters.
-        quaternion: (..., 4) as w, x, y, z; normalised here.
+        quaternion: (..., 4) as w, x, y, z, of any length above 0.
         translation: (..., 3), world units.
         height: image height in pixels, an int or (...).
         width: image width in pixels, an int or (...).
@@ -279,7 +277,7 @@ def from_colmap(
     if can_inspect(q) and not bool((q.abs().amax(-1) > 0).all()):
         raise CameraError(f"{who}: quaternion must not be zero")
     R = quaternion_to_rotation_matrix(q.reshape(-1, 4)).reshape(*q.shape[:-1], 3, 3)
-    return _made(who, K, R, _matrix(who, "translation", translation, 3), height, width, pixel_center)
+    return _join(who, K, R, _matrix(who, "translation", translation, 3), height, width, pixel_center)
 
 
 def to_colmap(cameras: Cameras, *, pixel_center: str = "half") -> ColmapCameras:
@@ -287,7 +285,7 @@ def to_colmap(cameras: Cameras, *, pixel_center: str = "half") -> ColmapCameras:
 
     Args:
         cameras: leading shape (...).
-        pixel_center: "half" or "integer", of the intrinsics returned.
+        pixel_center: "half" or "integer", of the returned intrinsics.
 
     Returns:
         `ColmapCameras`.
@@ -297,7 +295,7 @@ def to_colmap(cameras: Cameras, *, pixel_center: str = "half") -> ColmapCameras:
         >>> to_colmap(orbit(90.0, 0.0, 2.0, focal_length=50.0, height=48, width=64)).intrinsics[:2, 2]
         tensor([32., 24.])
     """
-    K, R, t = _taken("to_colmap", cameras, pixel_center)
+    K, R, t = _split("to_colmap", cameras, pixel_center)
     quaternion = rotation_matrix_to_quaternion(R.reshape(-1, 3, 3).contiguous()).reshape(*R.shape[:-2], 4)
     return ColmapCameras(K, quaternion, t)
 
@@ -315,8 +313,8 @@ def from_pytorch3d(
     """Cameras of PyTorch3D's ``PerspectiveCameras``: row vectors ``X_cam = X R + T``, x left, y up, z forward.
 
     Equation: with s = min(height, width) / 2, fx = s f_x, cx = width/2 - s p_x in normalised device coordinates
-    (``in_ndc=True``); in screen coordinates the focal length and principal point are pixels already. Both put pixel
-    centres at half-integers, so half a pixel is taken off.
+    (``in_ndc=True``); in screen coordinates focal length and principal point are in pixels. Both have half-integer
+    pixel centres, so half a pixel is subtracted.
 
     Args:
         R: (..., 3, 3).
@@ -363,12 +361,9 @@ def from_pytorch3d(
         scale = 0.5 * min(height, width)
         focal_length = scale * focal_length
         principal_point = principal_point.new_tensor([0.5 * width, 0.5 * height]) - scale * principal_point
-    fx, fy = focal_length.unbind(-1)
-    cx, cy = principal_point.unbind(-1)
-    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    K = torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
+    K = pinhole_matrix(*focal_length.unbind(-1), *principal_point.unbind(-1))
     flip = R.new_tensor([-1.0, -1.0, 1.0])
-    return _made(who, K, flip[:, None] * R.transpose(-1, -2) + 0.0, flip * T, height, width, "half")
+    return _join(who, K, flip[:, None] * R.transpose(-1, -2) + 0.0, flip * T, height, width, "half")
 
 
 def to_pytorch3d(cameras: Cameras, *, in_ndc: bool = True) -> PyTorch3DCameras:
@@ -376,13 +371,13 @@ def to_pytorch3d(cameras: Cameras, *, in_ndc: bool = True) -> PyTorch3DCameras:
 
     Args:
         cameras: leading shape (...).
-        in_ndc: whether to give normalised device coordinates or screen pixels.
+        in_ndc: whether to return normalised device coordinates or screen pixels.
 
     Returns:
         `PyTorch3DCameras`; pass the image size (height, width) to PyTorch3D too.
 
     Raises:
-        CameraError: a camera with skew, which PyTorch3D's class cannot hold.
+        CameraError: a camera with skew, which PyTorch3D does not support.
 
     Example:
         >>> from lsmgeo.cameras import orbit, to_pytorch3d
@@ -392,7 +387,7 @@ def to_pytorch3d(cameras: Cameras, *, in_ndc: bool = True) -> PyTorch3DCameras:
     who = "to_pytorch3d"
     check_flag(who, "in_ndc", in_ndc)
     tensors = as_tensors(cameras, who)
-    K, R, t = _taken(who, tensors, "half")
+    K, R, t = _split(who, tensors, "half")
     if can_inspect(K) and bool((K[..., 0, 1].abs() > 1e-6 * K[..., 0, 0]).any()):
         raise CameraError(f"{who}: cameras must have no skew, which PyTorch3D cannot hold")
     focal_length = K.diagonal(dim1=-2, dim2=-1)[..., :2]

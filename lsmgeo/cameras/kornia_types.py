@@ -1,4 +1,4 @@
-"""kornia's own camera classes, to the four fields of `lsmgeo.cameras.CameraTensors` and back."""
+"""Conversion between kornia's camera classes and the four fields of `lsmgeo.cameras.CameraTensors`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["PinholeCamera", "from_fields", "to_fields"]
 
 
 def to_fields(camera: PinholeCamera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Intrinsics, extrinsics, heights and widths of a ``PinholeCamera`` or, a subclass of it, ``PinholeCamerasList``.
+    """Intrinsics, extrinsics, heights and widths of a ``PinholeCamera`` or of its subclass ``PinholeCamerasList``.
 
     The matrices are (N, 4, 4) or (B, V, 4, 4) as kornia stores them, the sizes (N,) or (B,).
     """

@@ -1,4 +1,4 @@
-"""The small matrices of cameras, composed in float64: what the operators are made of."""
+"""Matrices of cameras in float64, from which the operators' matrices are composed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from lsmgeo._linalg import basis_row, inverse_3x3, multiply, transform
 from lsmgeo.cameras.tensors import CameraTensors, image_sizes
 
-__all__ = ["CameraMatrices", "camera_matrices", "resize_matrix"]
+__all__ = ["CameraMatrices", "camera_matrices", "pinhole_matrix", "resize_matrix"]
 
 
 class CameraMatrices(NamedTuple):
@@ -48,6 +48,12 @@ class CameraMatrices(NamedTuple):
         return torch.cat((rows, basis_row(rows, 4, 2)), -2)
 
 
+def pinhole_matrix(fx: Tensor, fy: Tensor, cx: Tensor, cy: Tensor) -> Tensor:
+    """K, (..., 3, 3), without skew, of focal lengths and principal points (...) of one shape."""
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
+
+
 def resize_matrix(
     height: Tensor, width: Tensor, new_height: int | Tensor, new_width: int | Tensor, dtype: torch.dtype = torch.float64
 ) -> Tensor:
@@ -58,23 +64,21 @@ def resize_matrix(
     """
     scale_x = new_width / width.to(dtype)
     scale_y = new_height / height.to(dtype)
-    zero, one = torch.zeros_like(scale_x), torch.ones_like(scale_x)
-    rows = (scale_x, zero, 0.5 * scale_x - 0.5, zero, scale_y, 0.5 * scale_y - 0.5, zero, zero, one)
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    return pinhole_matrix(scale_x, scale_y, 0.5 * scale_x - 0.5, 0.5 * scale_y - 0.5)
 
 
 def camera_matrices(
     cameras: CameraTensors, size: tuple[int, int] | None = None, view_mask: Tensor | None = None
 ) -> CameraMatrices:
-    """Bring cameras to float64, and their K to images of another size.
+    """Convert cameras to float64, and K to another image size.
 
     Args:
         cameras: from `as_tensors`, leading shape (...).
-        size: (height, width) of the images to be sampled; None keeps the cameras' own.
-        view_mask: (...) bool; cameras where it is False are unread: identity in their place, no gradient.
+        size: (height, width) of the images to be sampled; None for the cameras' own.
+        view_mask: (...) bool; cameras where it is False are not read and get no gradient: they become the identity.
 
     Returns:
-        `CameraMatrices`. The last rows of K and of the extrinsics are taken to be exact.
+        `CameraMatrices`. The last rows of K and of the extrinsics are not read.
     """
     intrinsics, cam_from_world = cameras.intrinsics, cameras.cam_from_world
     height, width = image_sizes(cameras)

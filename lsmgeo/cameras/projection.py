@@ -1,6 +1,6 @@
 """The pixel rule: points to pixels, depth to points, pixels to rays, and the camera centres.
 
-Everything is computed in float64, elementwise, and cast to the dtype of what was given.
+Everything is computed in float64, elementwise, and cast to the dtype of the input.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_devices, check_geometry, check_number, check_size
+from lsmgeo._checks import check_finite, check_geometry, check_number
 from lsmgeo._dtypes import saturating_cast
-from lsmgeo.cameras.camera_checks import check_cameras, common_size, views_of, views_per_scene
+from lsmgeo.cameras.camera_checks import check_cameras, check_views, image_size, views_per_scene
 from lsmgeo.cameras.matrices import camera_matrices
 from lsmgeo.cameras.tensors import Cameras, as_tensors, image_sizes
 from lsmgeo.debugging import can_inspect
@@ -22,7 +22,7 @@ __all__ = ["ProjectedPoints", "centers", "project", "rays", "unproject_depth"]
 
 
 class ProjectedPoints(NamedTuple):
-    """Where the images of V views show N points."""
+    """N points in the images of V views."""
 
     pixels: Tensor  # (B, V, N, 2) as u, v
     depth: Tensor  # (B, V, N)
@@ -30,13 +30,13 @@ class ProjectedPoints(NamedTuple):
 
 
 def project(cameras: Cameras, points: Tensor, *, near: float = 1e-6) -> ProjectedPoints:
-    """Project points of the world to the pixels of each camera's own image.
+    """Project world points to the pixels of each camera's own image.
 
     Equation: ``depth (u, v, 1) = K (R X + t)`` (Hartley and Zisserman, "Multiple View Geometry", equation 6.8).
 
     Convention:
         Integer pixel centres. Depth is camera z. A point is visible where its depth is more than `near` and its pixel
-        lies in [-0.5, width - 0.5) x [-0.5, height - 0.5); what hides it is not known here.
+        lies in [-0.5, width - 0.5) x [-0.5, height - 0.5); occlusion is not considered.
 
     Args:
         cameras: B*V cameras with the leading shape (B, V), or (B*V,) with the view fastest.
@@ -66,24 +66,23 @@ def project(cameras: Cameras, points: Tensor, *, near: float = 1e-6) -> Projecte
     if points.shape[2] != 3:
         raise ShapeError(f"{who}: points must be (B, N, 3); got {tuple(points.shape)}")
     tensors = as_tensors(cameras, who)
-    tensors = views_of(who, tensors, views_per_scene(who, tensors, points.shape[0], "points'"))
-    check_devices(who, cameras=tensors.intrinsics, points=points)
-    check_cameras(who, tensors)
-    _check_finite(who, "points", points)
+    tensors = check_views(who, tensors, views_per_scene(who, tensors, points.shape[0], "points'"), points=points)
+    if can_inspect(points):
+        check_finite(who, "points", points, GridError)
     homogeneous = camera_matrices(tensors).homogeneous_pixels(points.double()[:, None])  # (B, V, N, 3)
     distance = homogeneous[..., 2]
     depth = saturating_cast(distance, points.dtype)
     front = depth > near
     pixels = homogeneous[..., :2] / torch.where(front, distance, 1.0)[..., None]
     pixels = torch.where(front[..., None], saturating_cast(pixels, points.dtype), 0.0)
-    # Of the pixels as they are returned: rounding may bring one to the border.
+    # The returned pixels are tested: rounding may move one to the border.
     height, width = image_sizes(tensors)
     inside = (pixels >= -0.5) & (pixels < torch.stack((width, height), -1)[:, :, None].double() - 0.5)
     return ProjectedPoints(pixels, depth, front & inside.all(-1))
 
 
 def unproject_depth(cameras: Cameras, depth: Tensor) -> Tensor:
-    """Points of the world that the pixels of depth maps show; the inverse of `project` at a map's pixels.
+    """World points of the pixels of depth maps; the inverse of `project` at a map's pixels.
 
     Equation: ``X = C + depth R^T K^-1 (u, v, 1)`` at integer (u, v), with the camera centre ``C = -R^T t``.
 
@@ -114,10 +113,9 @@ def unproject_depth(cameras: Cameras, depth: Tensor) -> Tensor:
     B, V, height, width = depth.shape
     if V < 1 or height < 1 or width < 1:
         raise ShapeError(f"{who}: depth must be (B, V, h, w), V, h and w at least 1; got {tuple(depth.shape)}")
-    tensors = views_of(who, as_tensors(cameras, who), (B, V))
-    check_devices(who, cameras=tensors.intrinsics, depth=depth)
-    check_cameras(who, tensors)
-    _check_finite(who, "depth", depth)
+    tensors = check_views(who, as_tensors(cameras, who), (B, V), depth=depth)
+    if can_inspect(depth):
+        check_finite(who, "depth", depth, GridError)
     matrices = camera_matrices(tensors, (height, width))
     steps = matrices.pixel_steps(height, width)
     points = (matrices.center + 0.0)[:, :, None, None] + depth.double()[..., None] * steps
@@ -125,9 +123,7 @@ def unproject_depth(cameras: Cameras, depth: Tensor) -> Tensor:
 
 
 def centers(cameras: Cameras) -> Tensor:
-    """Camera centres in the world.
-
-    Equation: ``C = -R^T t``, the point that ``R X + t`` maps to 0.
+    """Camera centres in the world, ``C = -R^T t``.
 
     Args:
         cameras: leading shape (...).
@@ -161,7 +157,7 @@ def rays(cameras: Cameras, size: tuple[int, int] | None = None) -> tuple[Tensor,
         Camera centres (..., 3) in world units, and unit directions (..., h, w, 3). Differentiable in K, R and t.
 
     Raises:
-        CameraError: bad values, or no size given and views of different sizes.
+        CameraError: invalid cameras, or no size given for views of different sizes.
 
     Example:
         >>> from lsmgeo.cameras import orbit, rays
@@ -174,16 +170,8 @@ def rays(cameras: Cameras, size: tuple[int, int] | None = None) -> tuple[Tensor,
     who = "rays"
     tensors = as_tensors(cameras, who)
     check_cameras(who, tensors)
-    if size is None:
-        height, width = common_size(who, tensors)
-    else:
-        height, width = check_size(who, "size", size, 2, "(h, w)")
-    matrices = camera_matrices(tensors, (height, width))
-    steps = matrices.pixel_steps(height, width)
+    size = image_size(who, tensors, size)
+    matrices = camera_matrices(tensors, size)
+    steps = matrices.pixel_steps(*size)
     directions = steps / torch.linalg.vector_norm(steps, dim=-1, keepdim=True)
     return (matrices.center + 0.0).to(tensors.dtype), directions.to(tensors.dtype)
-
-
-def _check_finite(who: str, name: str, value: Tensor) -> None:
-    if can_inspect(value) and not bool(value.isfinite().all()):
-        raise GridError(f"{who}: {name} must be finite; got a NaN or an infinity")

@@ -12,34 +12,26 @@ from lsmgeo._checks import GEOMETRY, LARGEST_COUNT, check_devices, check_geometr
 from lsmgeo.cameras.kornia_types import PinholeCamera, from_fields, to_fields
 from lsmgeo.errors import CameraError, DTypeError, ShapeError
 
-__all__ = [
-    "CameraTensors",
-    "Cameras",
-    "as_tensors",
-    "image_sizes",
-    "select",
-    "stack",
-    "to",
-]
+__all__ = ["CameraTensors", "Cameras", "as_tensors", "image_sizes", "select", "stack", "to"]
 
 
 class CameraTensors(NamedTuple):
-    """Pinhole cameras as four tensors: a pytree, so it goes through export, vmap and data loaders (sizes as tensors).
+    """Pinhole cameras as four tensors: a pytree, for torch.export, vmap and data loaders (with sizes as tensors).
 
     Convention:
         ``x ~ K (R X + t)`` with OpenCV axes (x right, y down, z forward), world-to-camera extrinsics and integer pixel
         centres: pixel (0, 0) is centred at (0.0, 0.0) and the image covers [-0.5, width - 0.5) x [-0.5, height - 0.5).
 
     Attributes:
-        intrinsics: (..., 3, 3) calibration matrices K in pixels, last row (0, 0, 1), skew allowed; of a 4x4 matrix the
-            top-left 3x3 counts. float32 or float64.
+        intrinsics: (..., 3, 3) calibration matrices K in pixels, last row (0, 0, 1), skew allowed; the top-left 3x3 of
+            4x4 matrices is used. float32 or float64.
         cam_from_world: (..., 4, 4) rigid world-to-camera transforms ``[[R, t], [0, 0, 0, 1]]``, of the same dtype.
-        height: (...) image heights in pixels, (B,) where views share them, or one int for all.
+        height: (...) image heights in pixels, (B,) if the views of a scene share them, or one int for all.
         width: (...) image widths in pixels, likewise.
 
-    The leading shape is (B, V) where an operator takes V views of B scenes (or (B*V,), view fastest), and (B,) or ()
-    where one camera a scene is meant. This is a tuple of four fields: ``cameras[0]`` is the intrinsics of all cameras,
-    and ``cameras.at(0)`` the first camera.
+    The leading shape is (B, V), or (B*V,) with the view fastest, for V views of B scenes; (B,) or () for one camera per
+    scene. Indexing is that of a tuple of four fields: ``views[0]`` is the intrinsics of all cameras, ``views.at(0)``
+    the first camera.
 
     Example:
         >>> import torch
@@ -63,26 +55,26 @@ class CameraTensors(NamedTuple):
 
     @property
     def device(self) -> torch.device:
-        """Where the matrices are."""
+        """The device of the matrices."""
         return self.cam_from_world.device
 
     @property
     def dtype(self) -> torch.dtype:
-        """That of the matrices."""
+        """The dtype of the matrices."""
         return self.cam_from_world.dtype
 
     def at(self, index: Any) -> CameraTensors:
-        """Some of the cameras: `index` applies to the leading shape, as an index of a tensor of that shape does.
+        """The cameras at an index of the leading shape; the same index as for a tensor of that shape.
 
         Args:
             index: an int, a slice, a tensor or list of integers or booleans, ``None`` for a new axis, or a tuple of
-                such: of (B, V) cameras ``(slice(None), 0)`` is the first view of each scene.
+                these: ``(slice(None), 0)`` is the first view of each scene of (B, V) cameras.
 
         Returns:
-            `CameraTensors`; sizes that are ints stay as they are.
+            `CameraTensors`; sizes that are ints stay ints.
 
         Raises:
-            ShapeError: the leading shape has no such cameras.
+            ShapeError: the index does not fit the leading shape.
         """
         cameras = as_tensors(self, "CameraTensors.at")
         places = index if isinstance(index, tuple) else (index,)
@@ -97,13 +89,13 @@ class CameraTensors(NamedTuple):
         return CameraTensors(cameras.intrinsics[rows], cameras.cam_from_world[rows], height, width)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> CameraTensors:
-        """The cameras with `function` applied to intrinsics and cam_from_world; the sizes stay."""
+        """The cameras with `function` applied to intrinsics and cam_from_world, and the same sizes."""
         return self._replace(intrinsics=function(self.intrinsics), cam_from_world=function(self.cam_from_world))
 
     def to(
         self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None
     ) -> CameraTensors:
-        """The cameras on a device, in a dtype (which may come first too) or both; see `lsmgeo.cameras.to`."""
+        """The cameras on a device, in a dtype (the first argument may be either) or both; see `lsmgeo.cameras.to`."""
         return to(self, device, dtype)
 
     @classmethod
@@ -132,7 +124,7 @@ def _no_field(cameras: CameraTensors, name: str) -> Any:
     )
 
 
-# Set here, not defined above: type checkers would take every name and index for one that exists.
+# Assigned here: defined in the class, they would make type checkers accept any name and any index.
 CameraTensors.__getitem__ = _field  # type: ignore[method-assign, assignment]
 CameraTensors.__getattr__ = _no_field  # type: ignore[attr-defined]
 
@@ -140,19 +132,19 @@ Cameras = PinholeCamera | CameraTensors
 
 
 def as_tensors(cameras: Cameras, who: str = "cameras") -> CameraTensors:
-    """Bring any accepted form of cameras to `CameraTensors` with 3x3 intrinsics and sizes as tensors.
+    """Convert any accepted form of cameras to `CameraTensors` with 3x3 intrinsics and sizes as tensors.
 
     Args:
         cameras: `CameraTensors`, a kornia ``PinholeCamera`` with (N, 4, 4) or (B, V, 4, 4) storage, or a kornia
             ``PinholeCamerasList``.
-        who: the function that asks, named in errors.
+        who: the calling function, named in errors.
 
     Returns:
-        The cameras, with the leading shape they came with. Values are not checked here.
+        The cameras, of the same leading shape. Values are not checked.
 
     Raises:
         DTypeError: another type, or not float32 or float64.
-        ShapeError: shapes that do not belong together.
+        ShapeError: shapes that do not agree.
         DeviceError: tensors on different devices.
     """
     if isinstance(cameras, PinholeCamera):
@@ -172,7 +164,7 @@ def as_tensors(cameras: Cameras, who: str = "cameras") -> CameraTensors:
             f"{who}: cameras.cam_from_world must be (..., 4, 4), the whole world-to-camera matrix; "
             f"got {tuple(cam_from_world.shape)}"
         )
-    leading = tuple(cam_from_world.shape[:-2])
+    leading = cameras.shape
     if tuple(intrinsics.shape[:-2]) != leading:
         raise ShapeError(
             f"{who}: cameras.intrinsics and cameras.cam_from_world must agree in their leading shape; "
@@ -190,7 +182,7 @@ def as_tensors(cameras: Cameras, who: str = "cameras") -> CameraTensors:
 
 
 def image_sizes(cameras: CameraTensors) -> tuple[Tensor, Tensor]:
-    """Heights and widths as tensors, which they are after `as_tensors`."""
+    """Heights and widths of cameras from `as_tensors`, where they are tensors."""
     height, width = cameras.height, cameras.width
     assert isinstance(height, Tensor)
     assert isinstance(width, Tensor)
@@ -223,13 +215,13 @@ def stack(cameras: Sequence[Cameras], dim: int = 0) -> CameraTensors:
 
     Args:
         cameras: at least one; V cameras with leading shape (B,) stacked with ``dim=1`` give (B, V).
-        dim: where the new axis goes, 0 to the number of leading axes.
+        dim: position of the new axis, 0 to the number of leading axes.
 
     Returns:
         `CameraTensors` with the new leading axis.
 
     Raises:
-        DTypeError: no camera, or something else.
+        DTypeError: no camera, or items of another type.
         ShapeError: unequal leading shapes.
 
     Example:
@@ -241,23 +233,22 @@ def stack(cameras: Sequence[Cameras], dim: int = 0) -> CameraTensors:
     if not isinstance(cameras, (list, tuple)) or isinstance(cameras, CameraTensors) or not cameras:
         raise DTypeError(f"stack: cameras must be a list or tuple with at least one camera; got {describe(cameras)}")
     parts = [as_tensors(camera, "stack") for camera in cameras]
-    leading = [tuple(part.cam_from_world.shape[:-2]) for part in parts]
+    leading = [part.shape for part in parts]
     if len(set(leading)) > 1:
         raise ShapeError(f"stack: cameras must have one leading shape; got {leading}")
     if not is_whole(dim) or not 0 <= dim <= len(leading[0]):
         raise ShapeError(f"stack: dim must be 0 to {len(leading[0])}; got {describe(dim)}")
     check_devices("stack", **{f"cameras[{i}]": part.intrinsics for i, part in enumerate(parts)})
-    fields = (torch.stack(column, dim) for column in zip(*parts, strict=True))
-    return CameraTensors(*fields)
+    return CameraTensors(*(torch.stack(field, dim) for field in zip(*parts, strict=True)))
 
 
 def select(cameras: Cameras, dim: int, index: int) -> CameraTensors:
     """One camera along a leading axis, as ``torch.select`` does; `CameraTensors.at` takes any index.
 
     Args:
-        cameras: at least one leading axis; of (B, V) cameras ``select(cameras, 1, 0)`` is the first view of each scene.
-        dim: the axis that goes, 0 to the number of leading axes less 1.
-        index: which camera.
+        cameras: at least one leading axis; ``select(cameras, 1, 0)`` of (B, V) is the first view of each scene.
+        dim: the axis to remove, 0 to the number of leading axes less 1.
+        index: of the camera along that axis.
 
     Returns:
         `CameraTensors` without that axis.
@@ -284,20 +275,18 @@ def select(cameras: Cameras, dim: int, index: int) -> CameraTensors:
 def to(
     cameras: Cameras, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None
 ) -> CameraTensors:
-    """Move cameras to a device, a dtype (which may come first too) or both.
-
-    Sizes follow the device and keep their dtype.
+    """Move cameras to a device, convert their matrices to a dtype, or both; sizes keep their dtype.
 
     Args:
         cameras: any number of cameras.
-        device: where to, or a dtype alone.
+        device: a device, or only a dtype.
         dtype: float32 or float64.
 
     Returns:
         `CameraTensors`.
 
     Raises:
-        DTypeError: no device and no dtype, or one that does not exist or cameras do not come in.
+        DTypeError: neither is given, or an invalid one.
 
     Example:
         >>> import torch

@@ -1,4 +1,4 @@
-"""Cameras made, moved, resized and cropped."""
+"""Functions that create, move, resize and crop cameras."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from lsmgeo._checks import (
     GEOMETRY,
     check_broadcast,
     check_devices,
+    check_finite,
     check_geometry,
     check_number,
     check_size,
@@ -19,7 +20,7 @@ from lsmgeo._checks import (
 )
 from lsmgeo._linalg import cross, homogeneous_row, multiply, transform
 from lsmgeo.cameras.camera_checks import check_cameras
-from lsmgeo.cameras.matrices import resize_matrix
+from lsmgeo.cameras.matrices import pinhole_matrix, resize_matrix
 from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, DeviceError, DTypeError, OptionError, ShapeError
@@ -30,7 +31,7 @@ Vector = Tensor | Sequence[float]
 
 
 def resize(cameras: Cameras, height: int, width: int) -> CameraTensors:
-    """The cameras of the same images resized to (height, width).
+    """Cameras of the same images resized to (height, width).
 
     Equation: with sx = width'/width, fx' = fx sx, skew' = skew sx, cx' = (cx + 0.5) sx - 0.5; the same in y.
 
@@ -59,18 +60,12 @@ def resize(cameras: Cameras, height: int, width: int) -> CameraTensors:
     """
     height, width = check_size("resize", "(height, width)", (height, width), 2, "two integers")
     tensors = as_tensors(cameras, "resize")
-    old_height, old_width = image_sizes(tensors)
-    scale = resize_matrix(old_height, old_width, height, width, tensors.intrinsics.dtype)
-    return CameraTensors(
-        multiply(scale, tensors.intrinsics),
-        tensors.cam_from_world,
-        torch.full_like(old_height, height),
-        torch.full_like(old_width, width),
-    )
+    scale = resize_matrix(*image_sizes(tensors), height, width, tensors.dtype)
+    return _of_size(tensors, multiply(scale, tensors.intrinsics), height, width)
 
 
 def crop(cameras: Cameras, top: int | Tensor, left: int | Tensor, height: int, width: int) -> CameraTensors:
-    """The cameras of windows cut out of the same images (or of padded images, where top or left is negative).
+    """Cameras of windows of the same images (or of padded images, if top or left is negative).
 
     Equation: cx' = cx - left, cy' = cy - top.
 
@@ -95,19 +90,16 @@ def crop(cameras: Cameras, top: int | Tensor, left: int | Tensor, height: int, w
     """
     height, width = check_size("crop", "(height, width)", (height, width), 2, "two integers")
     tensors = as_tensors(cameras, "crop")
-    old_height, old_width = image_sizes(tensors)
-    K = tensors.intrinsics
-    leading = K.shape[:-2]
+    K, leading = tensors.intrinsics, tensors.shape
     x, y = (_number("crop", name, side, K, leading).to(K.dtype) for name, side in (("left", left), ("top", top)))
     check_devices("crop", cameras=K, left=x, top=y)
-    offset = torch.stack((x.expand(leading), y.expand(leading), x.new_zeros(leading)), -1)
-    shift = torch.nn.functional.pad(offset[..., None], (2, 0))  # third column
-    return CameraTensors(
-        K - shift,
-        tensors.cam_from_world,
-        torch.full_like(old_height, height),
-        torch.full_like(old_width, width),
-    )
+    offset = torch.stack((x.expand(leading), y.expand(leading)), -1)[..., None]
+    return _of_size(tensors, K - torch.nn.functional.pad(offset, (2, 0, 0, 1)), height, width)
+
+
+def _of_size(cameras: CameraTensors, intrinsics: Tensor, height: int, width: int) -> CameraTensors:
+    sizes = (torch.full_like(old, new) for old, new in zip(image_sizes(cameras), (height, width), strict=True))
+    return CameraTensors(intrinsics, cameras.cam_from_world, *sizes)
 
 
 def _vector(who: str, name: str, value: Vector, like: Tensor | None = None) -> Tensor:
@@ -120,7 +112,9 @@ def _vector(who: str, name: str, value: Vector, like: Tensor | None = None) -> T
     check_geometry(who, name, value, "(..., 3)")
     if value.dim() < 1 or value.shape[-1] != 3:
         raise ShapeError(f"{who}: {name} must be (..., 3); got {tuple(value.shape)}")
-    return _finite(who, name, value)
+    if can_inspect(value):
+        check_finite(who, name, value)
+    return value
 
 
 def _number(who: str, name: str, value: float | Tensor, like: Tensor, leading: Sequence[int] | None = None) -> Tensor:
@@ -132,24 +126,20 @@ def _number(who: str, name: str, value: float | Tensor, like: Tensor, leading: S
         value = like.new_tensor(check_number(who, name, value, "a finite number"))
     if leading is not None and check_broadcast(who, cameras=leading, **{name: value.shape}) != tuple(leading):
         raise ShapeError(f"{who}: {name} must broadcast to the cameras' {tuple(leading)}; got {tuple(value.shape)}")
-    return _finite(who, name, value)
-
-
-def _finite(who: str, name: str, value: Tensor) -> Tensor:
-    if can_inspect(value) and not bool(value.isfinite().all()):
-        raise OptionError(f"{who}: {name} must be finite; got a NaN or an infinity")
+    if can_inspect(value):
+        check_finite(who, name, value)
     return value
 
 
 def look_at(eye: Vector, target: Vector = (0.0, 0.0, 0.0), up: Vector = (0.0, 1.0, 0.0)) -> Tensor:
-    """World-to-camera matrices of cameras at `eye` that look at `target`, the world's `up` upwards in the image.
+    """World-to-camera matrices of cameras at `eye` that look at `target`, with `up` upwards in the image.
 
     Equation: z = normalize(target - eye), x = normalize(z x up), y = z x x are the rows of R; t = -R eye.
 
     Args:
         eye: (..., 3) camera centres, world units.
         target: (..., 3) points on the optical axes.
-        up: (..., 3) directions, not along the optical axis.
+        up: (..., 3) world directions, not along the optical axis.
 
     Returns:
         ``cam_from_world``, (..., 4, 4); differentiable in all arguments.
@@ -179,7 +169,7 @@ def _facing(who: str, names: str, eye: Tensor, target: Tensor, up: Tensor) -> Te
     if can_inspect(right):
         scale = torch.linalg.vector_norm(forward, dim=-1) * torch.linalg.vector_norm(up, dim=-1)
         if not bool((torch.linalg.vector_norm(right, dim=-1) > 1e-6 * scale).all()):
-            raise CameraError(f"{who}: {names} must span a plane (up is along the viewing direction, or there is none)")
+            raise CameraError(f"{who}: {names} must span a plane (up is along the viewing direction, or this is 0)")
     z = forward / torch.linalg.vector_norm(forward, dim=-1, keepdim=True)
     x = right / torch.linalg.vector_norm(right, dim=-1, keepdim=True)
     R = torch.stack(torch.broadcast_tensors(x, cross(z, x), z), -2) + 0.0  # + 0.0: no negative zeros
@@ -196,9 +186,9 @@ def orbit(
     width: int,
     target: Vector = (0.0, 0.0, 0.0),
 ) -> CameraTensors:
-    """Cameras on a sphere about a target, y up, all looking at the target.
+    """Cameras on a sphere around a target, y up, all looking at the target.
 
-    Equation: C = target + distance (cos e cos a, sin e, cos e sin a), the azimuth and elevation of ShapeNet renderings.
+    Equation: C = target + distance (cos e cos a, sin e, cos e sin a), azimuth and elevation as in ShapeNet renderings.
 
     Args:
         azimuth: degrees, a number or (...).
@@ -210,7 +200,7 @@ def orbit(
         target: (3,) or (..., 3).
 
     Returns:
-        `CameraTensors` with the arguments' common shape (...) as leading shape.
+        `CameraTensors`, whose leading shape is the arguments' common shape (...).
 
     Raises:
         CameraError: an elevation of 90 degrees, a distance of 0.
@@ -237,12 +227,11 @@ def orbit(
     turn, tilt, radius, focal = torch.broadcast_tensors(*numbers.values())
     a, e = torch.deg2rad(turn), torch.deg2rad(tilt)
     direction = torch.stack((e.cos() * a.cos(), e.sin(), e.cos() * a.sin()), -1)
-    zero, one = torch.zeros_like(focal), torch.ones_like(focal)
-    rows = (focal, zero, one * (0.5 * width - 0.5), zero, focal, one * (0.5 * height - 0.5), zero, zero, one)
     eye = target + radius[..., None] * direction
     up = eye.new_tensor([0.0, 1.0, 0.0])
     cam_from_world = _facing(who, "azimuth, elevation, distance and target", eye, target.expand_as(eye), up)
-    intrinsics = torch.stack(rows, -1).unflatten(-1, (3, 3)).expand(*eye.shape[:-1], 3, 3)
+    middle = (torch.full_like(focal, 0.5 * side - 0.5) for side in (width, height))
+    intrinsics = pinhole_matrix(focal, focal, *middle).expand(*eye.shape[:-1], 3, 3)
     cameras = as_tensors(CameraTensors(intrinsics, cam_from_world, height, width), who)
     check_cameras(who, cameras)
     return cameras
@@ -255,7 +244,7 @@ def perturb(
     target: Vector = (0.0, 0.0, 0.0),
     generator: torch.Generator | None = None,
 ) -> CameraTensors:
-    """Turn every camera about a target by a random rotation: pose noise under which it keeps looking at the object.
+    """Rotate each camera about a target at random: pose noise under which it keeps looking at the object.
 
     Equation: X_cam = R dR (X - target) + R target + t with dR a rotation about a uniformly random axis by an angle
     uniform in [-degrees, degrees]; the target keeps its place in the image.
@@ -264,10 +253,10 @@ def perturb(
         cameras: leading shape (...).
         degrees: largest angle.
         target: (3,) or (..., 3), world units: what the cameras look at.
-        generator: source of randomness on the cameras' device.
+        generator: random number generator on the cameras' device.
 
     Returns:
-        `CameraTensors`, each with a rotation of its own.
+        `CameraTensors`, each with its own rotation.
 
     Raises:
         OptionError: a negative or infinite angle.
@@ -285,14 +274,13 @@ def perturb(
     if generator is not None and not isinstance(generator, torch.Generator):
         raise DTypeError(f"{who}: generator must be a torch.Generator or None; got {describe(generator)}")
     tensors = as_tensors(cameras, who)
-    E = tensors.cam_from_world
+    E, leading = tensors.cam_from_world, tensors.shape
     if generator is not None and generator.device.type != E.device.type:
         raise DeviceError(f"{who}: generator must be on the cameras' {E.device}; got one on {generator.device}")
-    leading = E.shape[:-2]
     target = _vector(who, "target", target, E)
     check_devices(who, cameras=E, target=target)
-    if check_broadcast(who, cameras=leading, target=target.shape[:-1]) != tuple(leading):
-        raise ShapeError(f"{who}: target must broadcast to the cameras' {tuple(leading)}; got {tuple(target.shape)}")
+    if check_broadcast(who, cameras=leading, target=target.shape[:-1]) != leading:
+        raise ShapeError(f"{who}: target must broadcast to the cameras' {leading}; got {tuple(target.shape)}")
     axis = torch.randn(*leading, 3, generator=generator, dtype=E.dtype, device=E.device)
     axis = axis / torch.linalg.vector_norm(axis, dim=-1, keepdim=True).clamp_min(torch.finfo(E.dtype).tiny)
     angle = torch.rand(*leading, 1, generator=generator, dtype=E.dtype, device=E.device) * 2.0 - 1.0

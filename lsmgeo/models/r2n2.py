@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import leaky_relu
 
 from lsmgeo._checks import check_devices, check_float, check_mask
-from lsmgeo.cameras.camera_checks import check_cameras, views_of
+from lsmgeo.cameras.camera_checks import check_views
 from lsmgeo.cameras.tensors import Cameras, as_tensors
 from lsmgeo.errors import OptionError, ShapeError
 from lsmgeo.grids import VoxelGrid
@@ -282,9 +282,8 @@ class R2N2(VoxelModel):
 
     def _quaternions(self, cameras: Cameras, mask: Tensor, images: Tensor) -> Tensor:
         """(B, V, 4) as w, x, y, z; of masked views, whose cameras are not read, the identity."""
-        tensors = views_of(self.name, as_tensors(cameras, self.name), (mask.shape[0], mask.shape[1]))
-        check_devices(self.name, images=images, cameras=tensors.cam_from_world)
-        check_cameras(self.name, tensors, mask)
+        views = (mask.shape[0], mask.shape[1])
+        tensors = check_views(self.name, as_tensors(cameras, self.name), views, mask, images=images)
         R = tensors.cam_from_world[..., :3, :3]
         R = torch.where(mask[..., None, None], R, torch.eye(3, dtype=R.dtype, device=R.device))
         quaternions = rotation_matrix_to_quaternion(R)

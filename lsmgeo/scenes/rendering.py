@@ -8,9 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_devices, check_geometry, check_positive, check_size
+from lsmgeo._checks import check_devices, check_geometry, check_positive
 from lsmgeo.cameras import as_tensors
-from lsmgeo.cameras.camera_checks import check_cameras, common_size
+from lsmgeo.cameras.camera_checks import check_cameras, image_size
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
 from lsmgeo.cameras.tensors import Cameras
 from lsmgeo.errors import DTypeError, ShapeError
@@ -110,8 +110,7 @@ def render(
     if tensors.intrinsics.shape[1] == 0:
         raise ShapeError(f"{who}: cameras must have at least one view; got V = 0")
     check_cameras(who, tensors)
-    size = common_size(who, tensors) if size is None else check_size(who, "size", size, 2, "(h, w)")  # type: ignore[assignment]
-    assert size is not None
+    size = image_size(who, tensors, size)
     count, per_scene = tensors.intrinsics.shape[:2]
     device = tensors.intrinsics.device
     matrices = CameraMatrices(*(value.flatten(0, 1) for value in camera_matrices(tensors, size)))

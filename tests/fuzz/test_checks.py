@@ -52,7 +52,7 @@ MISTAKES = {
         "depths must be (P,), (B, P) or (B, V, P) with (B, V) = (2, 3); got (3, 5)": lambda: sweep(
             depths=DEPTHS.expand(3, 5)
         ),
-        "camera must have leading shape () or (B,), one a scene (see cameras.select); got (2, 3)": lambda: FrustumGrid(
+        "camera must have leading shape () or (B,), one per scene, see cameras.select; got (2, 3)": lambda: FrustumGrid(
             VIEWS, DEPTHS
         ),
         "PlaneSweepProject: size must be (h, w); got tuple (8,)": lambda: sweep(size=(8,)),

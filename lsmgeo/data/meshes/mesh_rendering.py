@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_choice, check_flag, check_number, check_size
+from lsmgeo._checks import check_choice, check_flag, check_number
 from lsmgeo.cameras import as_tensors
-from lsmgeo.cameras.camera_checks import check_cameras, common_size
+from lsmgeo.cameras.camera_checks import check_cameras, image_size
 from lsmgeo.cameras.matrices import camera_matrices
 from lsmgeo.cameras.tensors import Cameras
 from lsmgeo.data.meshes import DEFAULT_COLOUR, Mesh, check_mesh
@@ -97,8 +97,7 @@ def render_mesh(
     if tensors.intrinsics.dim() != 3:
         raise ShapeError(f"{who}: cameras must have the leading shape (V,); got {tensors.shape}")
     check_cameras(who, tensors)
-    size = common_size(who, tensors) if size is None else check_size(who, "size", size, 2, "(h, w)")  # type: ignore[assignment]
-    assert size is not None
+    size = image_size(who, tensors, size)
     lights = Lights(*(value[0] for value in checked_lights(who, lights, 1, torch.device("cpu"), torch.float32)))
     matrices = camera_matrices(tensors, size)
     centers = matrices.center.numpy(force=True)

@@ -24,7 +24,7 @@ from benchmarks.known_sets import BASELINE, FOCAL_LENGTH, OFFSET, write_motorcyc
 from benchmarks.measuring import Settings
 from benchmarks.triangulated import Depths, find_features, triangulate
 from lsmgeo import VoxelGrid, data, functional
-from lsmgeo.cameras import CameraTensors, resize, select, stack
+from lsmgeo.cameras import CameraTensors, project, resize, stack
 from lsmgeo.classical import Reconstruction, hull_box, reconstruct_scene, silhouettes, visual_hull
 from lsmgeo.classical.tsdf import voxel_side
 
@@ -171,8 +171,8 @@ def sparse_of(scene: data.PosedImages, view: int) -> Depths:
     """The depths of the set's own sparse points that a view observes."""
     assert scene.points is not None
     seen = scene.points.observations[view]
-    E = scene.cameras.cam_from_world[view].double().numpy()
-    return Depths(seen.pixels, scene.points.positions[seen.points] @ E[2, :3] + E[2, 3])
+    positions = torch.from_numpy(scene.points.positions[seen.points])
+    return Depths(seen.pixels, project(scene.camera(view).at(None), positions[None]).depth[0, 0].numpy())
 
 
 def errors_at(one: Reconstruction, truth: Depths, full: tuple[int, int], density: float) -> np.ndarray:
@@ -210,15 +210,14 @@ PUBLISHED = np.array([(-0.073568, 0.021728, -0.012445), (0.028855, 0.181892, 0.0
 
 def project_back(occupancy: torch.Tensor, grid: VoxelGrid, camera: CameraTensors, size: tuple[int, int]) -> Any:
     """The silhouette of voxels, (h, w) bool: the nearest voxels at depths a voxel apart, the largest along each ray."""
-    T, E = grid.world_from_lattice, camera.cam_from_world.double()
+    T, views = grid.world_from_lattice, camera.at(None)
     ends = (torch.tensor([-0.5, count - 0.5], dtype=torch.float64) for count in reversed(grid.shape))
-    depth = (torch.cartesian_prod(*ends) @ T[:3, :3].T + T[:3, 3]) @ E[2, :3] + E[2, 3]  # of the box's corners
+    depth = project(views, (torch.cartesian_prod(*ends) @ T[:3, :3].T + T[:3, 3])[None]).depth  # of the box's corners
     step = voxel_side(grid)
     planes = torch.arange(float(depth.min()), float(depth.max()) + step, step)
-    where = stack([camera]), grid
     return torch.stack(
         [
-            functional.plane_sweep_project(occupancy[None, None].float(), *where, some, size, mode="nearest")[0]
+            functional.plane_sweep_project(occupancy[None, None].float(), views, grid, some, size, mode="nearest")[0]
             .amax((0, 1, 2))
             .gt(0.5)
             for some in planes.split(64)
@@ -234,7 +233,7 @@ def temple(root: Path) -> Section:
     rows, title = [], "Visual hull, temple, 192^3"
     for rule, name in (("all", "strict intersection"), ("mean", "mean above 0.75")):
         occupancy = visual_hull(torch.stack(masks), scene.cameras, grid, rule=rule).occupancy
-        drawn = [project_back(occupancy, grid, select(scene.cameras, 0, view), scene.size(view)) for view in views]
+        drawn = [project_back(occupancy, grid, scene.camera(view), scene.size(view)) for view in views]
         scores = [float((a & b).sum() / (a | b).sum()) for a, b in zip(drawn, masks, strict=True)]
         sites, half = grid.centers()[occupancy], grid.world_from_lattice.diagonal()[:3] / 2
         away = 1000 * (torch.stack((sites.amin(0) - half, sites.amax(0) + half)).numpy() - PUBLISHED)

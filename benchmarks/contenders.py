@@ -14,7 +14,6 @@ from benchmarks import compiled, rivals
 from benchmarks.problems import LeftOut, Run, Scene, channels_last
 from lsmgeo import functional, rays
 from lsmgeo._sites import image_sites, sweep_sites
-from lsmgeo.cameras import CameraTensors
 from lsmgeo.kernels import Options
 from lsmgeo.kernels.native import library
 
@@ -49,7 +48,7 @@ def ours(scene: Scene, backend: str = "auto", fused: bool = True) -> Run:
     def products(features: Tensor) -> Any:
         # At the frustum's own pixels nothing is to be interpolated.
         first = features[:, :1, :, None, scene.window, scene.window]
-        others = CameraTensors(*(field[:, 1:] for field in scene.cameras))
+        others = scene.cameras.at((slice(None), slice(1, None)))
         volume, _ = functional.unproject(features[:, 1:], others, scene.grid, **options)
         return (volume * first).mean(2), None
 

@@ -42,9 +42,7 @@ picture = scenes.render([scene], view, lights, shadows=True)
 
 for dtype in (torch.float32, torch.float64):
     exact = scenes.render([scene], view, lights, dtype=dtype)
-    centers, directions = cameras.rays(view)
-    forward = view.cam_from_world[0, 0, 2, :3]
-    points = centers[0, 0] + directions[0, 0] * (exact.depth[0, 0].double() / (directions[0, 0] @ forward))[..., None]
+    points = cameras.unproject_depth(view, exact.depth.double())[0, 0]
     away = (points - torch.tensor([0.2, -0.02, 0.15], dtype=torch.float64)).norm(dim=-1) - 0.23
     on_ball = exact.mask[0, 0] & (away.abs() < 1e-3)
     worst = float(away[on_ball].abs().max())

@@ -32,8 +32,7 @@ for start, end in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
     piece = scenes.box((0, 0, 0), (length, 20.0, 0.01), paint).rotated(1, -math.degrees(slope))
     pieces.append(piece.moved((-0.93 + (middle - 1.5) / math.tan(slope), 0.0, middle)))
 lights = scenes.Lights(torch.zeros(0, 3), torch.zeros(0, 3), torch.ones(3))
-scene_views = cameras.CameraTensors(*(value[None] for value in views))
-seen = scenes.render([scenes.Scene(pieces)], scene_views, lights)
+seen = scenes.render([scenes.Scene(pieces)], views.at(None), lights)
 images, truth = seen.images[0], seen.depth[0, 0]
 print(f"true depth from {truth.min():.2f} to {truth.max():.2f}")
 

@@ -30,7 +30,7 @@ print("volume", tuple(volume.shape), "visible", tuple(visible.shape))
 # The number: the sphere's points that the camera sees, unprojected, against their paint. What is left is the error of
 # bilinear interpolation. Rays that graze the sphere are left out, because there a pixel mixes sphere and background.
 
-origins, _ = cameras.rays(views)
+origins = cameras.centers(views)
 normals = torch.nn.functional.normalize(torch.randn(1, 20_000, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
 points = 0.4 * normals
 to_camera = torch.nn.functional.normalize(origins - points, dim=-1)

@@ -25,7 +25,7 @@ scene = scenes.Scene(
 azimuth, elevation = torch.tensor([90.0, 80.0, 100.0, 90.0, 90.0]), torch.tensor([0.0, 0.0, 0.0, 10.0, -10.0])
 views = cameras.orbit(azimuth, elevation, 2.0, focal_length=200.0, height=120, width=160)
 lights = scenes.Lights(torch.zeros(0, 3), torch.zeros(0, 3), torch.ones(3))  # no shading: only the paint
-seen = scenes.render([scene], cameras.CameraTensors(*(torch.as_tensor(value)[None] for value in views)), lights)
+seen = scenes.render([scene], views.at(None), lights)
 images, truth = seen.images[0], seen.depth[0, 0]
 
 # %%

@@ -62,19 +62,15 @@ noisy = moved(truth, noise, torch.zeros_like(noise))
 # The surface, from the first camera's depth: a point for each pixel that has one. Points near the object's outline
 # are left out, because a camera that is wrong by two degrees may not see them.
 
-centers, directions = cameras.rays(noisy)
-forward = noisy.cam_from_world[:, :1, 2, :3][..., None, None, :]
-points = (
-    centers[:, :1, None, None] + directions[:, :1] * (depth[:, :1] / (directions[:, :1] * forward).sum(-1))[..., None]
-)
-points = torch.where(depth[:, :1].isfinite()[..., None], points, 0.0)[:, 0]
+centers = cameras.centers(noisy)
+known = depth[:, :1].isfinite()
+points = cameras.unproject_depth(noisy.at((slice(None), slice(1))), torch.where(known, depth[:, :1], 0.0))
+points = torch.where(known[..., None], points, 0.0)[:, 0]
 across, down = points[:, 1:-1, 2:] - points[:, 1:-1, :-2], points[:, 2:, 1:-1] - points[:, :-2, 1:-1]
 normals = torch.nn.functional.normalize(torch.linalg.cross(down, across), dim=-1)
 to_cameras = torch.nn.functional.normalize(centers[:, :, None, None] - points[:, None, 1:-1, 1:-1], dim=-1)
 facing = (to_cameras * normals[:, None]).sum(-1).amin(1) > 0.3
-whole = -torch.nn.functional.max_pool2d(
-    -depth[:, :1].isfinite().float(), 3, stride=1
-)  # 1 where all nine neighbours have depth
+whole = -torch.nn.functional.max_pool2d(-known.float(), 3, stride=1)  # 1 where all nine neighbours have depth
 facing &= whole[:, 0] == 1
 surface = points[:, 1:-1, 1:-1][facing][None]
 sites = surface[:, ::3]  # a third of them is plenty

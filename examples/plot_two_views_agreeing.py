@@ -50,7 +50,7 @@ deviation = variance[0, :, :, 64].sum(0).sqrt()  # (z, x) at y = 0
 shown = axes[0].imshow(deviation, origin="lower", extent=(-0.5, 0.5, -0.5, 0.5), cmap="magma", vmax=0.5)
 figure.colorbar(shown, ax=axes[0], label="standard deviation between the two views")
 axes[0].add_patch(plt.Circle((0, 0), 0.4, fill=False, color="white", ls=":", lw=1.5))
-centers, _ = cameras.rays(views)
+centers = cameras.centers(views)
 for x, _, z in centers[0].tolist():
     axes[0].annotate(
         "", (0.25 * x, 0.25 * z), (0.2 * x, 0.2 * z), arrowprops={"arrowstyle": "->", "color": "cyan", "lw": 2}

@@ -28,7 +28,7 @@ count = 24
 turns = torch.arange(count) * 137.5 % 360  # any first few of these stand well around
 views = cameras.orbit(turns, torch.linspace(0, 1, count) * 40 - 10, 2.0, focal_length=280.0, height=160, width=160)
 lights = scenes.Lights(torch.tensor([[0.3, 0.9, 0.3]]), torch.full((1, 3), 0.6), torch.full((3,), 0.3))
-masks = scenes.render([cup], cameras.CameraTensors(*(field[None] for field in views)), lights).mask[0]
+masks = scenes.render([cup], views.at(None), lights).mask[0]
 
 grid = VoxelGrid(64)
 solid, filled = (scenes.voxels([scene], grid)[0] for scene in (cup, full))
@@ -42,7 +42,7 @@ numbers = (1, 2, 3, 4, 6, 8, 12, 24)
 hulls = {}
 print("views  IoU with the cup  IoU with the cup filled  hollow filled")
 for number in numbers:
-    first = cameras.CameraTensors(*(field[:number] for field in views))
+    first = views.at(slice(number))
     hull = hulls[number] = visual_hull(outlines[:number], first, grid, rule="all", threshold=0.0)
     scores = [float(metrics.voxel_iou(hull.occupancy, truth)) for truth in (solid, filled)]
     inside = float(hull.occupancy[filled & ~solid].float().mean())
@@ -54,7 +54,7 @@ for number in numbers:
 
 figure, axes = plt.subplots(2, 4, figsize=(11.5, 5.8), layout="constrained")
 eye = cameras.orbit(torch.tensor([40.0]), 35.0, 2.0, focal_length=420.0, height=240, width=240)
-picture = scenes.render([cup], cameras.CameraTensors(*(field[None] for field in eye)), lights, shadows=True)
+picture = scenes.render([cup], eye.at(None), lights, shadows=True)
 axes[0, 0].imshow(picture.images[0, 0].permute(1, 2, 0))
 axes[0, 0].set_title("the cup")
 axes[1, 0].imshow(masks[7], cmap="gray_r")

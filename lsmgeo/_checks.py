@@ -26,6 +26,7 @@ __all__ = [
     "check_flag",
     "check_float",
     "check_geometry",
+    "check_last_axes",
     "check_mask",
     "check_number",
     "check_positive",
@@ -78,6 +79,15 @@ def check_geometry(
     check_float(who, name, value, expected, rank, dtypes)
     if value.numel() > LARGEST_COUNT:
         raise ShapeError(f"{who}: {name} must be {expected}, 2^31 - 1 numbers at most; got {tuple(value.shape)}")
+
+
+def check_last_axes(who: str, name: str, value: Any, *shape: int) -> Tensor:
+    """Require a float32 or float64 tensor (..., *shape): matrices, vectors."""
+    expected = f"(..., {', '.join(map(str, shape))})"
+    check_geometry(who, name, value, expected)
+    if tuple(value.shape[-len(shape) :]) != shape:
+        raise ShapeError(f"{who}: {name} must be {expected}; got {tuple(value.shape)}")
+    return value
 
 
 def check_finite(who: str, name: str, value: Tensor, error: type[Exception] = OptionError) -> None:

@@ -17,7 +17,15 @@ from kornia.geometry.conversions import (
 )
 from torch import Tensor
 
-from lsmgeo._checks import check_broadcast, check_choice, check_devices, check_flag, check_geometry, check_size
+from lsmgeo._checks import (
+    check_broadcast,
+    check_choice,
+    check_devices,
+    check_flag,
+    check_geometry,
+    check_last_axes,
+    check_size,
+)
 from lsmgeo._linalg import homogeneous_row, transform
 from lsmgeo.cameras.camera_checks import check_cameras, rotation_error
 from lsmgeo.cameras.matrices import pinhole_matrix
@@ -74,14 +82,6 @@ class PyTorch3DCameras(NamedTuple):
     T: Tensor
     focal_length: Tensor
     principal_point: Tensor
-
-
-def _matrix(who: str, name: str, value: Tensor, *shape: int) -> Tensor:
-    expected = f"(..., {', '.join(map(str, shape))})"
-    check_geometry(who, name, value, expected)
-    if tuple(value.shape[-len(shape) :]) != shape:
-        raise ShapeError(f"{who}: {name} must be {expected}; got {tuple(value.shape)}")
-    return value
 
 
 def _shifted(intrinsics: Tensor, pixels: float) -> Tensor:
@@ -144,9 +144,9 @@ def from_opencv(
         tensor([-1., -1.,  1.,  1.])
     """
     who = "from_opencv"
-    K = _matrix(who, "intrinsics", intrinsics, 3, 3)
+    K = check_last_axes(who, "intrinsics", intrinsics, 3, 3)
     check_geometry(who, "rotation", rotation, "(..., 3) or (..., 3, 3)")
-    t = _matrix(who, "translation", translation, 3)
+    t = check_last_axes(who, "translation", translation, 3)
     looks_like_matrices = tuple(rotation.shape[-2:]) == (3, 3)
     if looks_like_matrices and rotation.shape == t.shape and can_inspect(rotation):
         if bool((rotation_error(rotation) <= 1e-3).all()):
@@ -157,7 +157,7 @@ def from_opencv(
     if looks_like_matrices and rotation.shape != t.shape:
         R = rotation
     else:
-        vectors = _matrix(who, "rotation", rotation, 3)
+        vectors = check_last_axes(who, "rotation", rotation, 3)
         R = axis_angle_to_rotation_matrix(vectors.reshape(-1, 3)).reshape(*vectors.shape[:-1], 3, 3)
     return _join(who, K, R, t, height, width, pixel_center)
 
@@ -209,8 +209,8 @@ def from_opengl(
         (tensor([0., 0., 2.]), tensor([31.5000, 23.5000]))
     """
     who = "from_opengl"
-    K = _matrix(who, "intrinsics", intrinsics, 3, 3)
-    pose = _matrix(who, "world_from_cam", world_from_cam, 4, 4)
+    K = check_last_axes(who, "intrinsics", intrinsics, 3, 3)
+    pose = check_last_axes(who, "world_from_cam", world_from_cam, 4, 4)
     flip = pose.new_tensor([1.0, -1.0, -1.0])
     R = flip[:, None] * pose[..., :3, :3].transpose(-1, -2) + 0.0
     return _join(who, K, R, 0.0 - transform(R, pose[..., :3, 3]), height, width, pixel_center)
@@ -272,12 +272,12 @@ def from_colmap(
         tensor([31.5000, 23.5000])
     """
     who = "from_colmap"
-    K = _matrix(who, "intrinsics", intrinsics, 3, 3)
-    q = _matrix(who, "quaternion", quaternion, 4)
+    K = check_last_axes(who, "intrinsics", intrinsics, 3, 3)
+    q = check_last_axes(who, "quaternion", quaternion, 4)
     if can_inspect(q) and not bool((q.abs().amax(-1) > 0).all()):
         raise CameraError(f"{who}: quaternion must not be zero")
     R = quaternion_to_rotation_matrix(q.reshape(-1, 4)).reshape(*q.shape[:-1], 3, 3)
-    return _join(who, K, R, _matrix(who, "translation", translation, 3), height, width, pixel_center)
+    return _join(who, K, R, check_last_axes(who, "translation", translation, 3), height, width, pixel_center)
 
 
 def to_colmap(cameras: Cameras, *, pixel_center: str = "half") -> ColmapCameras:
@@ -340,9 +340,9 @@ def from_pytorch3d(
                 [ 0.0000,  0.0000,  1.0000]])
     """
     who = "from_pytorch3d"
-    R, T = _matrix(who, "R", R, 3, 3), _matrix(who, "T", T, 3)
+    R, T = check_last_axes(who, "R", R, 3, 3), check_last_axes(who, "T", T, 3)
     check_geometry(who, "focal_length", focal_length, "(..., 2) or (..., 1)")
-    principal_point = _matrix(who, "principal_point", principal_point, 2)
+    principal_point = check_last_axes(who, "principal_point", principal_point, 2)
     if focal_length.dim() < 1 or focal_length.shape[-1] not in (1, 2):
         raise ShapeError(f"{who}: focal_length must be (..., 2) or (..., 1); got {tuple(focal_length.shape)}")
     height, width = check_size(who, "(height, width)", (height, width), 2, "two integers")
@@ -356,7 +356,7 @@ def from_pytorch3d(
         principal_point=principal_point.shape[:-1],
     )
     focal_length, principal_point = torch.broadcast_tensors(focal_length, principal_point)
-    focal_length = _matrix(who, "focal_length", focal_length, 2)
+    focal_length = check_last_axes(who, "focal_length", focal_length, 2)
     if in_ndc:
         scale = 0.5 * min(height, width)
         focal_length = scale * focal_length

@@ -157,9 +157,9 @@ def as_tensors(cameras: Cameras, who: str = "cameras") -> CameraTensors:
     intrinsics, cam_from_world = cameras.intrinsics, cameras.cam_from_world
     check_geometry(who, "cameras.intrinsics", intrinsics, "(..., 3, 3) or (..., 4, 4)")
     check_geometry(who, "cameras.cam_from_world", cam_from_world, "(..., 4, 4)")
-    if intrinsics.dim() < 2 or tuple(intrinsics.shape[-2:]) not in ((3, 3), (4, 4)):
+    if tuple(intrinsics.shape[-2:]) not in ((3, 3), (4, 4)):
         raise ShapeError(f"{who}: cameras.intrinsics must be (..., 3, 3) or (..., 4, 4); got {tuple(intrinsics.shape)}")
-    if cam_from_world.dim() < 2 or tuple(cam_from_world.shape[-2:]) != (4, 4):
+    if tuple(cam_from_world.shape[-2:]) != (4, 4):
         raise ShapeError(
             f"{who}: cameras.cam_from_world must be (..., 4, 4), the whole world-to-camera matrix; "
             f"got {tuple(cam_from_world.shape)}"

@@ -14,6 +14,7 @@ from lsmgeo._checks import (
     check_devices,
     check_finite,
     check_geometry,
+    check_last_axes,
     check_number,
     check_size,
     describe,
@@ -109,9 +110,7 @@ def _vector(who: str, name: str, value: Vector, like: Tensor | None = None) -> T
             value = torch.as_tensor(value, dtype=dtype or torch.get_default_dtype(), device=device)
         except (TypeError, ValueError) as error:
             raise OptionError(f"{who}: {name} must be x, y, z; got {value!r}") from error
-    check_geometry(who, name, value, "(..., 3)")
-    if value.dim() < 1 or value.shape[-1] != 3:
-        raise ShapeError(f"{who}: {name} must be (..., 3); got {tuple(value.shape)}")
+    check_last_axes(who, name, value, 3)
     if can_inspect(value):
         check_finite(who, name, value)
     return value

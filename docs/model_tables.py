@@ -1,4 +1,4 @@
-"""Directives that read the learnt models: their layers, their presets, and every key of a training configuration."""
+"""Directives of the model pages: layers, presets, and every key of a training configuration."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GROUPS = configuration.GROUPS
 
 
 def layer_rows(name: str, preset: str, variant: str) -> list[list[str]]:
-    """Every stage of a model: what it does and reads, what it gives, its parameters."""
+    """Every stage of a model: operation, inputs, output, parameters."""
     stages = traced(name, preset, variant)
     rows = [["stage", "what it does", "reads, if not the one before", "gives", "parameters"]]
     for before, stage in zip((None, *stages), stages, strict=False):
@@ -63,7 +63,7 @@ def preset_rows() -> list[list[str]]:
 
 
 def config_rows(group: str) -> list[list[str]]:
-    """Every key of a group of the training configuration, with its default and what its class says of it."""
+    """Every key of a group of the training configuration, with its default and the docstring of its class."""
     form = GROUPS[group]
     told = attributes_of(form)
     rows = [["key", "default", "what it is"]]
@@ -74,7 +74,7 @@ def config_rows(group: str) -> list[list[str]]:
 
 
 def attributes_of(form: type) -> dict[str, str]:
-    """What a class's docstring says of its attributes."""
+    """The attributes in a class's docstring."""
     text = inspect.getdoc(form) or ""
     section = text.partition("Attributes:\n")[2]
     return {
@@ -83,7 +83,7 @@ def attributes_of(form: type) -> dict[str, str]:
 
 
 def as_rst(text: str) -> str:
-    """Names between single quotes of code stay code, where they would link to nothing."""
+    """Names in single backquotes, as code where they would link to nothing."""
     return re.sub(r"(?<!`)`([^`.]+)`(?!`)", r"``\1``", text)
 
 
@@ -98,7 +98,7 @@ def curve_rows(found: dict[str, Any]) -> list[list[str]]:
 
 
 def curve_text(found: dict[str, Any]) -> str:
-    """What the curve is of."""
+    """The run of the curve."""
     settings, last = found["configuration"], found["curve"][-1]
     return (
         f"{found['parameters']:,} parameters, {found['shapes']:,} shapes; {last['step']:,} steps of "
@@ -109,7 +109,7 @@ def curve_text(found: dict[str, Any]) -> str:
 
 
 def experiment_rows(group: str) -> list[list[str]]:
-    """Every run of the queue, or of the trials, with what is known of it."""
+    """Every run of the queue, or of the trials, with its results."""
     rows = [["run", "what", "CPU minutes", "training took", "steps", "IoU, or median depth error"]]
     for experiment in {"queue": queue.QUEUE, "trials": queue.TRIALS}[group]:
         found = load(f"experiments/{experiment.name}")
@@ -168,7 +168,7 @@ class Experiments(Rows):
 
 
 class Curve(SphinxDirective):
-    """``.. training-curve::``: what was measured of the run whose curve is drawn."""
+    """``.. training-curve::``: the measures of the run whose curve is drawn."""
 
     def run(self) -> list[nodes.Node]:
         found = load(CURVE)

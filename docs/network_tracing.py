@@ -1,4 +1,4 @@
-"""What a model's stages make of two views, read from the model itself: the drawings and tables of the model pages.
+"""The stages of a model, traced on two views, for the drawings and tables of the model pages.
 
 Forward hooks tell the order of the stages, their shapes and parameters; `torch.cat` is watched to tell which stages
 read which others, so that skip connections are found and not written down.
@@ -32,11 +32,11 @@ class Stage:
     """One part of a model.
 
     Attributes:
-        name: dotted, of its module; "images" for what goes in.
-        what: it does, in words.
+        name: dotted, of its module; "images" for the input.
+        what: its operation, in words.
         shape: of one scene's, or one view's, output: (C, D, H, W), (C, H, W) or (C,).
-        parameters: how many it has.
-        sources: the stages that it reads, the one before it first.
+        parameters: their number.
+        sources: the stages that it reads, the preceding one first.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Stage:
 
     @property
     def part(self) -> str:
-        """The model's attribute that it belongs to."""
+        """The model's attribute to which it belongs."""
         return self.name.partition(".")[0]
 
 
@@ -68,12 +68,12 @@ class _Joins(TorchFunctionMode):
 
 
 def _place(tensor: Tensor) -> int:
-    """Where its numbers lie: the same for views of a tensor."""
+    """The address of its values: the same for views of a tensor."""
     return tensor.untyped_storage().data_ptr()
 
 
 def stages_of(model: nn.Module) -> list[tuple[str, nn.Module]]:
-    """Every stage of a model by its dotted name, whole networks taken apart."""
+    """Every stage of a model by its dotted name; containers are replaced by their stages."""
 
     def walk(module: nn.Module, prefix: str) -> Any:
         for name, child in module.named_children():
@@ -86,7 +86,7 @@ def stages_of(model: nn.Module) -> list[tuple[str, nn.Module]]:
 
 
 def trace(model: nn.Module) -> list[Stage]:
-    """Run a model on two views of nothing and tell its stages in the order in which they ran.
+    """Run a model on two random images and return its stages in the order in which they ran.
 
     Args:
         model: from `lsmgeo.models.create`.
@@ -96,7 +96,7 @@ def trace(model: nn.Module) -> list[Stage]:
     images = torch.rand(1, VIEWS, 3, size, size, generator=torch.Generator().manual_seed(0))
     found = [Stage("images", f"{size} x {size} pixels", (3, size, size), 0)]
     made = {_place(images): "images"}
-    kept: list[Tensor] = [images]  # nothing may be freed: its place would be given to another tensor
+    kept: list[Tensor] = [images]  # nothing may be freed: another tensor would get its address
     joins = _Joins()
 
     def sources_of(tensor: Tensor) -> list[str]:
@@ -110,7 +110,7 @@ def trace(model: nn.Module) -> list[Stage]:
         if not sources_of(given):
             if name == "rotation.0":
                 found.append(Stage("cameras", "the rotation as a quaternion", _shape(module, given), 0))
-            made[_place(given)] = found[-1].name  # a copy of what the stage before gave
+            made[_place(given)] = found[-1].name  # a copy of the preceding stage's output
         sources = list(dict.fromkeys(sources_of(given)))
         parameters = sum(weight.numel() for weight in module.parameters())
         found.append(Stage(name, describe(module), _shape(module, values), parameters, sources))
@@ -152,7 +152,7 @@ def _watched(module: nn.Module, ran: Callable[[Tensor, Tensor], None]) -> Callab
 
 
 def _shape(module: nn.Module, values: Tensor) -> tuple[int, ...]:
-    """Of one scene and view: what is left of its shape without the axes before the channels."""
+    """The shape for one scene and view, without the axes before the channels."""
     if isinstance(module, Unproject) or hasattr(module, "hidden_channels") or type(module).__name__ == "_Recurrence":
         return tuple(values.shape[2:])
     if isinstance(module, PlaneSweepProject):
@@ -166,7 +166,7 @@ def _shape(module: nn.Module, values: Tensor) -> tuple[int, ...]:
 
 
 def describe(module: nn.Module) -> str:
-    """What a stage does, in a few words."""
+    """The operation of a stage, in a few words."""
     if isinstance(module, Block):
         words = [_kernel(module.convolution)]
         words += [] if isinstance(module.norm, nn.Identity) else ["norm"]

@@ -1,7 +1,7 @@
 """The queue of experiments, see docs/experiments.
 
-"list" says what is done and what is next, "next" trains and evaluates the next one (or that of a name), "collect" keeps
-the results of those that are finished.
+"list" shows what is done and what is next, "next" trains and evaluates the next one (or the named one), "collect" keeps
+the results of finished ones.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("command", choices=("list", "next", "collect"))
     parser.add_argument("name", nargs="?", help="for next: an experiment; by default the first that is not finished")
     parser.add_argument(
-        "--folder", type=Path, default=Path("experiments"), help="where the set and the runs lie (%(default)s)"
+        "--folder", type=Path, default=Path("experiments"), help="of the set and the runs (%(default)s)"
     )
     options = parser.parse_args(argv)
     folder = Folder(options.folder)
@@ -61,7 +61,7 @@ def show(folder: Folder) -> None:
 
 
 def state(experiment: Experiment, folder: Folder) -> str:
-    """How far a run is: "done", also where its results are committed, the step that it has come to, or nothing."""
+    """The state of a run: "done" (also where its results are committed), the step it has reached, or nothing."""
     if (collecting.RESULTS / f"{experiment.name}.json").is_file() or folder.is_done(experiment):
         return "done"
     steps = checkpoint_folders(folder.run(experiment))

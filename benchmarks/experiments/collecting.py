@@ -1,4 +1,4 @@
-"""What is kept of finished runs: a JSON file each, and the weights that ship. The same run gives the same file."""
+"""The results of finished runs: a JSON file each, and the weights that ship. The same run gives the same file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PRETRAINED = Path(lsmgeo.models.__file__).parent / "pretrained"
 
 
 def collect(folder: Folder) -> list[Path]:
-    """Write what is to be committed of all finished runs, and tell the files."""
+    """Write the results of all finished runs, to be committed, and return the files' paths."""
     written = []
     for experiment in ALL:
         if folder.is_done(experiment):
@@ -39,10 +39,10 @@ def collect(folder: Folder) -> list[Path]:
 
 
 def keep(experiment: Experiment, folder: Folder) -> dict[str, Any]:
-    """What is kept of a finished run."""
+    """The results of a finished run."""
     path = folder.run(experiment)
     config = json.loads((path / "config.json").read_text(encoding="utf-8"))
-    config["data"]["source"] = "set"  # where it lies says nothing elsewhere
+    config["data"]["source"] = "set"  # its path means nothing on another machine
     log, start = read_log(path / "log.jsonl")
     return {
         **{key: getattr(experiment, key) for key in ("what", "minutes", "ships", "is_tested")},
@@ -70,7 +70,7 @@ def read_log(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
 
 
 def number(value: Any) -> Any:
-    """A number of the log, or a mapping of such; None for what was not finite, which the log has as text."""
+    """A number of the log, or a mapping of numbers; None for those that are not finite, which the log has as text."""
     if isinstance(value, dict):
         return {key: number(item) for key, item in value.items()}
     return None if isinstance(value, str) else value

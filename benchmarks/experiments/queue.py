@@ -1,4 +1,4 @@
-"""What is trained, in order. Rows are compared only at equal CPU minutes, which include the evaluation."""
+"""The trainings, in order. Rows are compared only at equal CPU minutes, which include the evaluation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["ALL", "EVALUATION_MINUTES", "QUEUE", "SET", "SHAPES", "Experiment", 
 # The set of all runs; `set.json` beside this file holds the hash of its values.
 SET = Recipe(seed=0, views=8, size=128, voxels=(32,), depth=True, shadows=False)
 SHAPES = 12_000
-# What the evaluation of a network takes of its minutes, and what further reports take.
+# Minutes of an experiment for the evaluation of its network, and for further reports.
 EVALUATION_MINUTES = {"voxels": 6.0, "depth": 8.0, "backgrounds": 1.5, "pose-noise": 3.0, "order": 5.0}
 
 
@@ -25,24 +25,24 @@ class Experiment:
     """One run."""
 
     name: str  # of its folder and of its results
-    what: str  # what it is for, in words
+    what: str  # its purpose, in words
     minutes: float  # of CPU time, evaluation included
     model: str  # the network, as `lsmgeo.models.create` knows it
-    settings: Mapping[str, Any] = field(default_factory=dict)  # what differs from its usual training, as "group.key"
+    settings: Mapping[str, Any] = field(default_factory=dict)  # in place of its usual training's, as "group.key"
     preset: str = "standard"  # of the network
-    reports: Sequence[str] = ()  # what else it is measured by, see ``lsmgeo evaluate``, on fewer test shapes
+    reports: Sequence[str] = ()  # further ones, see ``lsmgeo evaluate``, on fewer test shapes
     ships: bool = False  # whether its weights become part of the package
     # Whether its weights are measured on the test split; else only training measures them, on the validation split.
     is_tested: bool = True
 
     @property
     def output(self) -> str:
-        """What the network gives: "voxels" or "depth"."""
+        """The network's output: "voxels" or "depth"."""
         return "depth" if self.model == "depth-lsm" else "voxels"
 
     @property
     def evaluation_minutes(self) -> float:
-        """What is kept of the minutes for the evaluation of the weights."""
+        """The minutes reserved for the evaluation of the weights."""
         if not self.is_tested:
             return 0.0
         return EVALUATION_MINUTES[self.output] + sum(EVALUATION_MINUTES[report] for report in self.reports)
@@ -122,7 +122,7 @@ SHORT = {"run.precision": "bf16", "run.cpu_minutes": None, "run.steps": 10, "run
 CHANNELS = {"channels": [32, 64, 128, 192, 192], "hidden": 96, "decoder": [96, 48, 24]}
 V_BEFORE = {"model.settings": BEFORE, "run.loss": "bce", **EVERY}
 
-# What settings were chosen by, on the validation split; run by name.
+# Settings were chosen by these, on the validation split; run by name.
 TRIALS = tuple(
     replace(trial, is_tested=False, preset="compact")
     for trial in (

@@ -37,7 +37,7 @@ EVALUATION, WEIGHTS = "evaluation.json", "weights.safetensors"
 RECIPE = Path(__file__).with_name("set.json")
 # Of every category, in the order of the set: the test split of a table.
 TEST_SHAPES, CATEGORIES, VIEWS = 80, 13, 8
-# Half precision may change so much of the measure on the validation split.
+# Half precision may change the measure on the validation split by this share.
 LOSSLESS = 1e-3
 # Of every category, where a report takes a set many times.
 FEW_SHAPES = 20
@@ -45,7 +45,7 @@ THRESHOLDS = (0.2, 0.3, 0.4, 0.5)
 
 
 class Folder:
-    """Where the set and the runs lie; made if it is not there."""
+    """The folder of the set and the runs; made if it does not exist."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -61,7 +61,7 @@ class Folder:
 
 
 def run_experiment(experiment: Experiment, folder: Folder) -> int:
-    """Train an experiment, or go on with it, then evaluate it; on one thread, at the lowest priority.
+    """Train or resume an experiment, then evaluate it; on one thread, at the lowest priority.
 
     Returns:
         The exit status: that of training where it was stopped.
@@ -122,7 +122,7 @@ def hash_shapes(shards: ShardSet, indices: Sequence[int]) -> str:
 
 
 def evaluate_test(experiment: Experiment, model: Model, validation: dict[str, Any], folder: Folder) -> dict[str, Any]:
-    """What the tables of a network need: its measure on the test split by views and categories, and further reports."""
+    """The content of a network's tables: its measure on the test split by views and categories, and further reports."""
     shapes = evaluation.open_shapes(folder.set, size=model.image_size, shapes=TEST_SHAPES * CATEGORIES)
     about = f"{len(shapes)} test shapes of the set of the experiments"
     if model.output == "depth":
@@ -157,7 +157,7 @@ def numbers(table: Any) -> dict[str, dict[str, float | None]]:
 
 
 def depth_by_views(model: Model, shapes: Any) -> dict[str, Any]:
-    """The median depth error of all views that a model was given, by their number, and of categories."""
+    """The median depth error of all views of the input, by their number, and of categories."""
     measures = {views: DepthError() for views in (1, 2, 4, 8)}
     for batch in batches(shapes, VIEWS, 4, resolution=None, depth=True, progress=True):
         for views, measure in measures.items():
@@ -173,10 +173,10 @@ def depth_by_views(model: Model, shapes: Any) -> dict[str, Any]:
 
 
 def ship(experiment: Experiment, model: Model, path: Path, folder: Folder) -> tuple[Model, dict[str, float]]:
-    """Write the weights that the package takes, in half precision if that loses nothing.
+    """Write the weights that ship with the package, in half precision if that loses nothing.
 
     Returns:
-        The model of what was written, and the measure on the validation split by precision.
+        The model as written, and the measure on the validation split by precision.
     """
     about = dict(read_weights(path).about)
     about["training"]["data"]["source"] = "the set of benchmarks.experiments"
@@ -184,7 +184,7 @@ def ship(experiment: Experiment, model: Model, path: Path, folder: Folder) -> tu
     try:
         half = load(write_weights(file, model, about=about, half=True))
         found["float16"] = validate(half, experiment, folder)
-    except OptionError:  # a weight is too large
+    except OptionError:  # a weight overflows
         pass
     if not abs(found.get("float16", math.inf) - found["float32"]) <= LOSSLESS * found["float32"]:
         write_weights(file, model, about=about)
@@ -192,7 +192,7 @@ def ship(experiment: Experiment, model: Model, path: Path, folder: Folder) -> tu
 
 
 def held_back(model: Model, experiment: Experiment, folder: Folder) -> Iterator[Batch]:
-    """The shapes that training was evaluated on."""
+    """The shapes on which training was evaluated."""
     config, device = experiment.config(folder.set), torch.device("cpu")
     run = config.run
     need = Need(model.image_size, model.resolution if model.output == "voxels" else None, model.output == "depth")
@@ -201,7 +201,7 @@ def held_back(model: Model, experiment: Experiment, folder: Folder) -> Iterator[
 
 
 def validate(model: Model, experiment: Experiment, folder: Folder) -> float:
-    """The measure after all views on the shapes that training was evaluated on."""
+    """The measure after all views on the shapes on which training was evaluated."""
     run, some = experiment.config(folder.set).run, held_back(model, experiment, folder)
     found = evaluate_model(model, some, StopRequest(), region=run.region, loss=run.loss, images=0)
     assert found is not None
@@ -209,7 +209,7 @@ def validate(model: Model, experiment: Experiment, folder: Folder) -> float:
 
 
 def validate_thresholds(model: Model, experiment: Experiment, folder: Folder) -> dict[str, float]:
-    """IoU after all views on the same shapes, by the probability from which a voxel is solid."""
+    """IoU after all views on the same shapes, by the probability above which a voxel is occupied."""
     measures = {level: VoxelIoU(threshold=level) for level in THRESHOLDS}
     for batch in held_back(model, experiment, folder):
         occupancy = model.run(batch.images, batch.cameras, batch.view_mask, by_view=False).occupancy  # type: ignore[operator]

@@ -1,4 +1,4 @@
-"""The same errors under confidences that know much, little and nothing of them."""
+"""The same errors under confidences that are strongly, weakly and not related to them."""
 
 import matplotlib.pyplot as plt
 import torch
@@ -7,7 +7,7 @@ from lsmgeo.metrics import density_curve
 
 generator = torch.Generator().manual_seed(0)
 number = 100_000
-# One answer in five is a wrong match, anywhere; the others are off by a little.
+# One value in five is a wrong match, anywhere; the others have small errors.
 wrong = torch.rand(number, generator=generator) < 0.2
 errors = torch.where(wrong, 20 * torch.rand(number, generator=generator), 0.3 * torch.rand(number, generator=generator))
 noise = torch.rand(number, generator=generator)

@@ -1,4 +1,4 @@
-"""The models drawn as they are built: a box for every stage with its channels and size, arrows for what it reads."""
+"""Drawings of the built models: a box for every stage with its channels and size, arrows from its inputs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import FancyArrowPatch, Polygon
 from network_tracing import Stage, traced
 
-# Parts of a model: what they are called, their colour, and the row that they are drawn in.
+# Parts of a model: name, colour and row in the drawing.
 PARTS = {
     "images": ("images", "0.75", 0),
     "image_encoder": ("image encoder, each image by itself", "#8fb8de", 0),
@@ -74,7 +74,7 @@ def draw(name: str, preset: str = "paper") -> Axes:
 
 
 def row_of(stages: list[Stage], stage: Stage) -> int:
-    """The row that a stage is drawn in; what comes last stays with what comes before it."""
+    """The row of a stage; last stages stay in the row of those before them."""
     part = stage.part
     if part in PARTS:
         return PARTS[part][2]
@@ -162,7 +162,7 @@ def link(
 
 
 def titles(axes: Axes, stages: list[Stage], places: dict[str, tuple[float, float]]) -> None:
-    """The name of every part over the boxes that belong to it."""
+    """The name of every part above its boxes."""
     spans: dict[tuple[str, int], list[float]] = {}
     for stage in stages:
         title = PARTS[stage.part][0] if stage.part in PARTS else LAST[0]

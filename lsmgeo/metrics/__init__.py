@@ -1,4 +1,4 @@
-"""How well a reconstruction agrees with the truth: pure functions, and forms that take a set in pieces."""
+"""Measures of reconstructions against the ground truth: pure functions, and classes that accumulate over a set."""
 
 from lsmgeo.metrics.clouds import CloudScores, point_cloud_scores
 from lsmgeo.metrics.curves import DensityCurve, RunningDensityCurve, density_curve

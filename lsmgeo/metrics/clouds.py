@@ -16,7 +16,7 @@ __all__ = ["CloudScores", "point_cloud_scores"]
 
 
 class CloudScores(NamedTuple):
-    """How near two point clouds are to each other."""
+    """Distances between two point clouds."""
 
     accuracy: float  # mean distance of a predicted point to the nearest true one, world units
     completeness: float  # mean distance of a true point to the nearest predicted one, world units
@@ -28,26 +28,26 @@ class CloudScores(NamedTuple):
 def point_cloud_scores(
     predicted: Tensor | np.ndarray, true: Tensor | np.ndarray, threshold: float, *, cell: float | None = None
 ) -> CloudScores:
-    """Compare two point clouds by the distances to the nearest point of the other.
+    """Compare two point clouds by the distances of their points to the nearest point of the other.
 
     Equation: precision ``P = |{p : min_t |p - t| < threshold}| / |predicted|``, recall R the same with the clouds
     exchanged, F-score ``2 P R / (P + R)`` (Knapitsch et al. 2017, section 4); accuracy and completeness are the mean
-    distances in the two directions. To an empty cloud every distance is infinite; of an empty one there is none, so
-    its measures are NaN. The F-score is 0 where one cloud is empty, and NaN where both are.
+    distances in the two directions. Distances to an empty cloud are infinite, and measures over its points are NaN. The
+    F-score is 0 where one cloud is empty, and NaN where both are.
 
     Args:
         predicted: (N, 3), a tensor or an array.
         true: (M, 3).
         threshold: world units, above 0.
-        cell: if given, the points of either cloud within one cube of this side are replaced by their mean first, so
-            that places where points are dense count no more than others (Knapitsch et al.: half the threshold).
+        cell: if given, the points of either cloud within a cube of this side are first replaced by their mean, so that
+            dense regions count no more than others (Knapitsch et al.: half the threshold).
 
     Returns:
         `CloudScores`. Nothing is differentiable.
 
     Raises:
         ShapeError: a cloud is not (N, 3).
-        DTypeError: a cloud is no array of numbers.
+        DTypeError: a cloud is not an array of numbers.
         OptionError: a coordinate is not finite, ``threshold`` or ``cell`` is not above 0.
 
     Example:

@@ -1,4 +1,4 @@
-"""Error against density: how good the best pixels are, when confidence says which these are."""
+"""Error against density: the error of the most confident pixels."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ STATISTICS = ("median", "mean", "bad")
 
 
 class DensityCurve(NamedTuple):
-    """The error among the pixels of the highest confidence, at several densities; each (K,)."""
+    """The error of the most confident pixels at several densities; each (K,)."""
 
-    density: Tensor  # float64, the share that is really kept: pixels of one confidence are kept or left together
-    error: Tensor  # float64, NaN where fewer pixels have a confidence than asked for
-    pixels: Tensor  # int64, how many are kept
+    density: Tensor  # float64, the share actually kept: pixels of equal confidence are kept or dropped together
+    error: Tensor  # float64, NaN where too few pixels have a confidence
+    pixels: Tensor  # int64, the number kept
 
 
 @torch.no_grad()
@@ -36,20 +36,20 @@ def density_curve(
     statistic: str = "median",
     threshold: float | None = None,
 ) -> DensityCurve:
-    """Measure the error among the most confident pixels, for several densities.
+    """Measure the error of the most confident pixels, for several densities.
 
     Equation: at density d of n pixels that count, the statistic of the errors of the pixels whose confidence is at
-    least that of the ``ceil(d n)``-th in descending order. Pixels of the same confidence are kept or left together, so
-    the order of the pixels never matters; the density that comes of it is told.
+    least that of the ``ceil(d n)``-th in descending order. Pixels of equal confidence are kept or dropped together, so
+    that the order of the pixels does not matter; the resulting density is reported.
 
-    Convention: a confidence of 0, below, or NaN means that there is no answer at this pixel. It still counts among n:
-    density is a share of the pixels that have a truth.
+    Convention: a confidence that is 0, negative or NaN means that the pixel has no prediction. It still counts among n:
+    density is a share of the pixels with ground truth.
 
     Args:
-        errors: floating, of any shape, at least 0; all pixels are taken together. NaN counts as infinite.
+        errors: floating, of any shape, at least 0; all pixels form one set. NaN counts as infinite.
         confidence: floating, of the same shape.
         densities: in (0, 1].
-        mask: bool, of the same shape: the pixels that have a truth; None for all.
+        mask: bool, of the same shape: the pixels with ground truth; None for all.
         statistic: "median", "mean", or "bad": the share of errors above the threshold.
         threshold: for "bad", in the units of the errors.
 
@@ -59,7 +59,8 @@ def density_curve(
     Raises:
         ShapeError: shapes differ.
         DTypeError: a tensor is of another dtype.
-        OptionError: a density outside (0, 1], an unknown statistic, a threshold that is missing or too many.
+        OptionError: a density outside (0, 1], an unknown statistic, a threshold that is missing, or given
+            for another statistic.
 
     Example:
         >>> import torch
@@ -76,10 +77,10 @@ def density_curve(
 
 
 class RunningDensityCurve:
-    """A density curve of many maps taken together, which come one by one.
+    """A density curve over many maps, accumulated one by one.
 
-    It keeps an error and a confidence for every pixel that counts, 16 bytes. `compute` equals `density_curve` on all of
-    them at once, in whatever order they came.
+    It keeps an error and a confidence for every pixel that counts, 16 bytes. `compute` equals `density_curve` on all
+    maps at once, in any order.
 
     Args:
         densities: in (0, 1].
@@ -105,12 +106,12 @@ class RunningDensityCurve:
         self._parts: list[tuple[Tensor, Tensor]] = []
 
     def update(self, errors: Tensor, confidence: Tensor, mask: Tensor | None = None) -> None:
-        """Take the pixels of more maps; arguments as in `density_curve`."""
+        """Add the pixels of more maps; arguments as in `density_curve`."""
         errors, confidence = _taken("RunningDensityCurve.update", errors, confidence, mask)
         self._parts.append((errors.cpu(), confidence.cpu()))
 
     def merge(self, other: RunningDensityCurve) -> None:
-        """Take what another one has seen, for instance in another process.
+        """Add the pixels of another curve, for instance of another process.
 
         Raises:
             OptionError: its options differ.
@@ -121,7 +122,7 @@ class RunningDensityCurve:
         self._parts += other._parts
 
     def compute(self) -> DensityCurve:
-        """The curve of everything seen so far."""
+        """The curve of all pixels so far."""
         empty = torch.zeros(0, dtype=torch.float64)
         errors, confidence = (torch.cat([empty, *(part[i] for part in self._parts)]) for i in (0, 1))
         return _curve(errors, confidence, self.densities, self.statistic, self.threshold)
@@ -130,7 +131,7 @@ class RunningDensityCurve:
 def _check_options(
     who: str, densities: Sequence[float], statistic: str, threshold: float | None
 ) -> tuple[tuple[float, ...], float | None]:
-    """The densities and the threshold as Python's numbers."""
+    """The densities and the threshold as Python numbers."""
     expected = "numbers in (0, 1]"
     if isinstance(densities, Tensor) or not isinstance(densities, Iterable):
         raise DTypeError(f"{who}: densities must be {expected}; got {describe(densities)}")
@@ -161,11 +162,11 @@ def _curve(
     confidence, order = confidence.sort(descending=True)
     errors = errors[order]
     answered = int((confidence > 0).sum())
-    # Where the pixels of one confidence end: ascending values are what searchsorted takes.
+    # Where pixels of equal confidence end; searchsorted needs ascending values.
     ascending = (-confidence[:answered]).contiguous()
     kept, found = [], []
     for density in densities:
-        # 0.07 * 100 is a little above 7.
+        # In floats 0.07 * 100 is above 7.
         wanted = max(1, math.ceil(density * number - 1e-9 * number))
         enough = number > 0 and wanted <= answered
         count = int(torch.searchsorted(ascending, ascending[wanted - 1], right=True)) if enough else 0

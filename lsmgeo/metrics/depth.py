@@ -27,35 +27,35 @@ class DepthErrors(NamedTuple):
     delta2: Tensor  # ... < 1.25^2
     delta3: Tensor  # ... < 1.25^3
     density: Tensor  # share of the pixels with a true depth that have a predicted one
-    pixels: Tensor  # (...) int64, how many count
+    pixels: Tensor  # (...) int64, the number that count
 
 
 class BadPixels(NamedTuple):
-    """How many pixels are off by more than a threshold; each (...)."""
+    """The share of pixels whose error is above a threshold; each (...)."""
 
     rate: Tensor  # float64 in [0, 1], NaN where no pixel counts
     density: Tensor  # float64, share of the pixels with a true value that have a predicted one
-    pixels: Tensor  # int64, how many count
+    pixels: Tensor  # int64, the number that count
 
 
 class MedianDepthError(NamedTuple):
     """The paper's measure of depth maps; each (...)."""
 
     error: Tensor  # float64, world units, NaN where no pixel counts
-    pixels: Tensor  # int64, how many count
+    pixels: Tensor  # int64, the number that count
 
 
 @torch.no_grad()
 def depth_errors(predicted: Tensor, depth: Tensor, mask: Tensor | None = None) -> DepthErrors:
-    """Measure depth maps by the usual errors.
+    """The usual errors of depth maps.
 
     Equation: with p predicted, d true, over the n pixels that count: l1 ``sum |p - d| / n``, abs_rel
     ``sum |p - d| / d / n``, rmse ``sqrt(sum (p - d)^2 / n)``, delta_k the share with ``max(p / d, d / p) < 1.25^k``
-    (Eigen, Puhrsch and Fergus 2014, section 4). A prediction below 0 is in no delta; one that is NaN neither, and
-    makes the other errors of its map NaN.
+    (Eigen, Puhrsch and Fergus 2014, section 4). Predictions that are negative or NaN are in no delta; NaN also makes
+    the other errors of its map NaN.
 
     Convention: depth is camera z, 0 means none. A pixel counts where the mask allows it, the true depth is above 0 and
-    finite, and the prediction is not 0. ``density`` says how many are left out for the last reason.
+    finite, and the prediction is not 0. ``density`` is the share that is not left out for the last reason.
 
     Args:
         predicted: (..., h, w) floating.
@@ -63,7 +63,7 @@ def depth_errors(predicted: Tensor, depth: Tensor, mask: Tensor | None = None) -
         mask: (..., h, w) bool, pixels that may count; None allows all.
 
     Returns:
-        `DepthErrors`, one value a map. Nothing is differentiable.
+        `DepthErrors`, one value per map. Nothing is differentiable.
 
     Raises:
         ShapeError: shapes differ.
@@ -97,7 +97,7 @@ def depth_errors(predicted: Tensor, depth: Tensor, mask: Tensor | None = None) -
 def bad_pixel_rate(
     predicted: Tensor, true: Tensor, threshold: float, mask: Tensor | None = None, *, missing: str = "skip"
 ) -> BadPixels:
-    """Count the pixels whose error is above a threshold, of disparity or of depth.
+    """The share of pixels whose error of disparity or depth is above a threshold.
 
     Equation: the share of the pixels that count with ``|p - t| > threshold`` (Scharstein and Szeliski 2002,
     section 5.1).
@@ -113,7 +113,7 @@ def bad_pixel_rate(
         missing: "skip" or "bad".
 
     Returns:
-        `BadPixels`, one value a map. Nothing is differentiable.
+        `BadPixels`, one value per map. Nothing is differentiable.
 
     Raises:
         ShapeError: shapes differ.
@@ -154,10 +154,10 @@ def median_depth_error(
     radius: float = RADIUS,
     rule: str = "paper",
 ) -> MedianDepthError:
-    """Measure depth maps as Kar et al. 2017 (section 4, "Comparison to Plane Sweeping") do.
+    """The depth error of Kar et al. 2017 (section 4, "Comparison to Plane Sweeping").
 
-    Equation: ``median |p - d|`` over the pixels that count; of an even number the mean of the two in the middle. A
-    prediction that is NaN has an infinite error.
+    Equation: ``median |p - d|`` over the pixels that count; for an even number the mean of the middle two. A prediction
+    that is NaN has an infinite error.
 
     Convention: depth is camera z, 0 means none; an object in the unit cube about the origin, seen from distance
     ``center``, lies within ``center +- sqrt(3) / 2``. A pixel counts where both depths exist and
@@ -165,7 +165,7 @@ def median_depth_error(
     - ``rule="paper"``: the *true* depth lies in the range, ends included ("the evaluation region is limited to a depth
       range of +-sqrt(3)/2");
     - ``rule="release"``: the *predicted* depth lies in the range, ends excluded, as the authors' released code has it.
-      What is predicted far away is then not counted, and a method that errs grossly looks better.
+      Pixels predicted far away are then not counted, and a method with gross errors looks better.
 
     The caption of the paper's table says mean L1; text and code say median.
 
@@ -178,7 +178,7 @@ def median_depth_error(
         rule: "paper" or "release".
 
     Returns:
-        `MedianDepthError`, one value a map. Nothing is differentiable. `DepthError` takes the mean over the views of
+        `MedianDepthError`, one value per map. Nothing is differentiable. `DepthError` takes the mean over the views of
         a model, the models of a category, and the categories.
 
     Raises:
@@ -210,7 +210,7 @@ def median_depth_error(
 
 
 def middle_of_lowest(values: Tensor, count: Tensor) -> Tensor:
-    """The median of the ``count`` (...) lowest of (..., N) values, NaN where that is none."""
+    """The median of the ``count`` (...) lowest of (..., N) values, NaN where ``count`` is 0."""
     if values.shape[-1] == 0:
         return torch.full_like(count, torch.nan, dtype=values.dtype)
     ordered = values.sort(-1).values
@@ -221,12 +221,12 @@ def middle_of_lowest(values: Tensor, count: Tensor) -> Tensor:
 def _compared(
     who: str, name: str, predicted: Tensor, depth: Tensor, mask: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Both depths in float64 (the true one 1 where it does not count), where there is truth, and what counts."""
+    """Both depths in float64 (the true one 1 where it does not count), where truth exists, and which pixels count."""
     _check_maps(who, name, predicted, depth, mask)
     p, d = predicted.double(), depth.double()
     true = torch.isfinite(d) & (d > 0)
     true = true if mask is None else true & mask
-    # A truth of 0 or NaN must not reach a division, not even of a pixel that is left out.
+    # A true depth of 0 or NaN must not reach a division, not even at a pixel that is left out.
     return p, torch.where(true, d, 1.0), true, true & (p != 0)
 
 

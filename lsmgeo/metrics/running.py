@@ -1,4 +1,4 @@
-"""Measures of whole sets, which come batch by batch and from several processes."""
+"""Measures of whole sets, accumulated over batches and processes."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ __all__ = ["CategoryMeans", "DepthError", "Running", "VoxelIoU", "category_means
 
 
 class CategoryMeans(NamedTuple):
-    """A measure of a set of models: the mean of each category, and the mean of these."""
+    """A measure of a set of models: the mean of each category, and the mean of the categories."""
 
-    mean: float  # of the categories that have one; NaN where none has
+    mean: float  # over the categories that have one; NaN where none has
     categories: dict[str, float]  # in alphabetical order; NaN where no model counts
-    counts: dict[str, int]  # the models that count
+    counts: dict[str, int]  # of models that count
 
 
 def category_means(values: Tensor | Sequence[float], categories: Sequence[str]) -> CategoryMeans:
     """Average a measure within each category, then over the categories.
 
     Every category weighs the same, however many models it has (Kar et al. 2017, section 4: "we compute a per class
-    average and take the mean"). A value that is NaN is that of a model without any pixel that counts: it is left out.
-    Sums are rounded once (`math.fsum`), so the order of the models never matters.
+    average and take the mean"). NaN, the value of a model without any pixel that counts, is left out. Sums are rounded
+    once (`math.fsum`), so that the order of the models does not matter.
 
     Args:
-        values: (B,), one number a model.
+        values: (B,), one number per model.
         categories: B names.
 
     Returns:
         `CategoryMeans`.
 
     Raises:
-        ShapeError: not as many values as names.
-        DTypeError: a category that is no name.
+        ShapeError: numbers of values and names differ.
+        DTypeError: a category that is not text.
 
     Example:
         >>> from lsmgeo.metrics import category_means
@@ -55,15 +55,15 @@ def category_means(values: Tensor | Sequence[float], categories: Sequence[str]) 
 
 
 class Running:
-    """Any measure of single models, averaged over a set that comes in parts.
+    """Any measure of single models, averaged over a set in parts.
 
-    One number a model and field is kept, so `compute` equals, to the last digit, `category_means` of one call on
-    everything, whatever the parts and their order. What several processes have seen is brought together by `merge`: an
-    object of this class is small and can be pickled (``torch.distributed.all_gather_object``).
+    One number per model and field is kept, so that `compute` equals, to the last digit, `category_means` of one call on
+    everything, for any parts in any order. `merge` joins the results of several processes: objects of this class are
+    small and can be pickled (``torch.distributed.all_gather_object``).
 
     Args:
-        measure: a function of this package whose values are (B,) tensors or numbers, or named tuples of such.
-        options: what every call of it is given by name.
+        measure: a function of this package that returns (B,) tensors or numbers, or named tuples of them.
+        options: keyword arguments of every call.
 
     Example:
         >>> import torch
@@ -79,7 +79,7 @@ class Running:
         self._fields: dict[str, dict[str, list[float]]] = {}
 
     def update(self, *arguments: Any, categories: Sequence[str] | str = "all") -> None:
-        """Measure more models.
+        """Add more models.
 
         Args:
             arguments: those of the measure.
@@ -93,7 +93,7 @@ class Running:
             _collect(f"{self.measure.__name__}, Running.update", self._fields.setdefault(name, {}), numbers, names)
 
     def merge(self, other: Running) -> None:
-        """Take what another one has seen.
+        """Add the models of another one.
 
         Raises:
             OptionError: it measures something else.
@@ -105,19 +105,19 @@ class Running:
             _extend(self._fields.setdefault(field, {}), collected)
 
     def compute(self) -> dict[str, CategoryMeans]:
-        """Means of every field of the measure, of everything seen so far."""
+        """Means of every field of the measure, over all models so far."""
         return {name: _means(collected) for name, collected in self._fields.items()}
 
 
 class _OneMeasure:
-    """One number a model, averaged over a set that comes in parts."""
+    """One number per model, averaged over a set in parts."""
 
     def __init__(self, **options: Any):
         self.options = options
         self._collected: dict[str, list[float]] = {}
 
     def merge(self, other: Self) -> None:
-        """Take what another one has seen.
+        """Add the models of another one.
 
         Raises:
             OptionError: its options differ.
@@ -128,14 +128,14 @@ class _OneMeasure:
         _extend(self._collected, other._collected)
 
     def compute(self) -> CategoryMeans:
-        """The means of everything seen so far; NaN where nothing was."""
+        """The means over all models so far; NaN where there is none."""
         return _means(self._collected)
 
 
 class VoxelIoU(_OneMeasure):
     """Voxel IoU of a set: per category, and the mean of the categories. See `voxel_iou`, `category_means`, `Running`.
 
-    Models whose truth has no voxel count nowhere.
+    Models whose true occupancy is empty are left out.
 
     Args:
         threshold: of the probabilities.
@@ -155,7 +155,7 @@ class VoxelIoU(_OneMeasure):
         super().__init__(threshold=check_number("VoxelIoU", "threshold", threshold, "a number"))
 
     def update(self, predicted: Tensor, occupancy: Tensor, categories: Sequence[str] | str = "all") -> None:
-        """Measure more models.
+        """Add more models.
 
         Args:
             predicted: (B, D, H, W), see `voxel_iou`.
@@ -170,8 +170,8 @@ class VoxelIoU(_OneMeasure):
 class DepthError(_OneMeasure):
     """The paper's depth error of a set: median per map, mean over maps, models and categories.
 
-    Views without any pixel that counts are left out of a model's mean, models without any such view out of their
-    category's. See `median_depth_error`, `category_means`, `Running`.
+    Views without any pixel that counts are left out of a model's mean, and models that have only such views out of
+    their category's. See `median_depth_error`, `category_means`, `Running`.
 
     Args:
         center: see `median_depth_error`.
@@ -189,12 +189,12 @@ class DepthError(_OneMeasure):
 
     def __init__(self, *, center: float = 2.0, radius: float = RADIUS, rule: str = "paper"):
         super().__init__(center=center, radius=radius, rule=rule)
-        median_depth_error(torch.zeros(0, 0), torch.zeros(0, 0), **self.options)  # a wrong option is told here
+        median_depth_error(torch.zeros(0, 0), torch.zeros(0, 0), **self.options)  # checks the options
 
     def update(
         self, predicted: Tensor, depth: Tensor, categories: Sequence[str] | str = "all", mask: Tensor | None = None
     ) -> None:
-        """Measure more models.
+        """Add more models.
 
         Args:
             predicted: (B, V, h, w).
@@ -223,7 +223,7 @@ def _collect(
         except (TypeError, ValueError, RuntimeError, OverflowError):
             raise DTypeError(f"{who}: values must be numbers, one a model; got {describe(values)}") from None
     elif not values.is_complex() and values.layout == torch.strided:
-        values = values.double()  # counts of pixels are whole numbers
+        values = values.double()  # counts of pixels are integers
     check_float(who, "values", values, "(B,), one a model", rank=1)
     numbers = moved(who, "values", values, torch.device("cpu")).tolist()
     names = [categories] * len(numbers) if isinstance(categories, str) else list(categories)

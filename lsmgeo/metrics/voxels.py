@@ -13,25 +13,25 @@ __all__ = ["voxel_iou"]
 
 @torch.no_grad()
 def voxel_iou(predicted: Tensor, occupancy: Tensor, *, threshold: float = 0.4, skip_empty: bool = False) -> Tensor:
-    """Measure how much of two solids' union they share.
+    """Intersection over union of voxel grids.
 
     Equation: ``|P and T| / |P or T|`` over the voxels of a grid, with P the voxels whose probability is above the
-    threshold. Two empty grids agree: 1. (Kar et al. 2017, section 4: 0.4 for all methods but the visual hull, 0.75.)
+    threshold. Two empty grids agree: 1. (Kar et al. 2017, section 4: 0.75 for the visual hull, 0.4 for the others.)
 
     Args:
-        predicted: (..., D, H, W) probabilities of any floating dtype, NaN counts as empty; or bool, taken as it is.
-        occupancy: bool, of the same shape: the truth.
+        predicted: (..., D, H, W) probabilities of any floating dtype, where NaN counts as empty; or bool.
+        occupancy: bool, of the same shape: the ground truth.
         threshold: of the probabilities.
-        skip_empty: whether grids whose truth has no voxel are NaN, so that means leave them out: a thin shape may have
-            none at a coarse resolution, and says nothing about a method.
+        skip_empty: whether the IoU is NaN where the truth is empty, so that means leave it out: a thin shape may have
+            no voxel at a coarse resolution, and then says nothing about a method.
 
     Returns:
-        (...) float64 in [0, 1], or NaN, one a grid. Nothing is differentiable.
+        (...) float64 in [0, 1], or NaN, one per grid. Nothing is differentiable.
 
     Raises:
         ShapeError: the shapes differ, or there are fewer than three axes.
         DTypeError: ``occupancy`` is not bool.
-        OptionError: ``threshold`` is no number, or ``skip_empty`` neither True nor False.
+        OptionError: ``threshold`` is not a number, or ``skip_empty`` not a bool.
 
     Example:
         >>> import torch
@@ -51,9 +51,9 @@ def voxel_iou(predicted: Tensor, occupancy: Tensor, *, threshold: float = 0.4, s
     check_mask(who, "occupancy", occupancy, tuple(predicted.shape), "of the shape of predicted")
     check_devices(who, predicted=predicted, occupancy=occupancy)
     level = check_number(who, "threshold", threshold, "a number")
-    solid = predicted if predicted.dtype == torch.bool else predicted > level
-    shared = (solid & occupancy).sum((-3, -2, -1)).double()
-    union = (solid | occupancy).sum((-3, -2, -1)).double()
+    occupied = predicted if predicted.dtype == torch.bool else predicted > level
+    shared = (occupied & occupancy).sum((-3, -2, -1)).double()
+    union = (occupied | occupancy).sum((-3, -2, -1)).double()
     iou = torch.where(union > 0, shared / union.clamp_min(1), 1.0)
     if check_flag(who, "skip_empty", skip_empty):
         iou = torch.where(occupancy.flatten(-3).any(-1), iou, torch.nan)

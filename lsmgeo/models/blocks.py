@@ -1,4 +1,4 @@
-"""What the networks share: convolutions by exact strides, instance norm, the base classes of models."""
+"""Shared by the networks: convolutions by exact strides, instance norm, the base classes of models."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class InstanceNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Normalise (N, C, ...)."""
-        # One group a channel. On a CPU, channels-last memory costs it nine times as much as the copy.
+        # One group per channel. On a CPU, channels-last memory costs nine times as much as this copy.
         return group_norm(x.contiguous(), x.shape[1], self.weight, self.bias)
 
 
@@ -156,13 +156,7 @@ class Block(nn.Module):
         super().__init__()
         self.activate = activate
         self.convolution = Convolution(
-            dims,
-            in_channels,
-            out_channels,
-            kernel_size,
-            stride=stride,
-            transposed=transposed,
-            bias=norm == "none",
+            dims, in_channels, out_channels, kernel_size, stride=stride, transposed=transposed, bias=norm == "none"
         )
         self.norm = nn.Identity() if norm == "none" else InstanceNorm(out_channels, scale=norm == "scale")
 
@@ -172,18 +166,7 @@ class Block(nn.Module):
 
 
 def interleave(parts: Tensor, factor: int) -> Tensor:
-    """Channels as the voxels of a finer grid.
-
-    Args:
-        parts: (N, factor^3, D, H, W), z slowest.
-        factor: how much finer.
-
-    Returns:
-        (N, 1, factor D, factor H, factor W).
-
-    Raises:
-        RuntimeError: another number of channels.
-    """
+    """Channels (N, factor^3, D, H, W), z slowest, as voxels of a finer grid (N, 1, factor D, factor H, factor W)."""
     x = parts.unflatten(1, (factor, factor, factor))  # (N, z, y, x, D, H, W)
     x = x.permute(0, 4, 1, 5, 2, 6, 3)
     return x.flatten(5, 6).flatten(3, 4).flatten(1, 2)[:, None]
@@ -196,10 +179,10 @@ class Model(nn.Module):
         name: its name in `lsmgeo.models.create`.
         settings: what it is built from, a frozen dataclass that JSON can hold.
         output: "voxels" or "depth".
-        image_size: side in pixels of the square images that it is meant for.
+        image_size: side in pixels of the square images that it is made for.
         resolution: voxels along a side of its finest grid.
         grid: that grid.
-        prefers_channels_last: whether it trains faster on CPUs with maps kept pixel by pixel in memory.
+        prefers_channels_last: whether it trains faster on CPUs with channels-last maps.
         about: the notes of the file that it was loaded from, if any.
     """
 
@@ -255,7 +238,7 @@ def evaluation_mode(model: nn.Module) -> Iterator[None]:
 
 
 def shift_principal_point(who: str, cameras: Cameras, pixels: float) -> CameraTensors:
-    """Cameras whose principal points are shifted by so many pixels, to the right and down."""
+    """Cameras with principal points shifted by a number of pixels, to the right and down."""
     tensors = as_tensors(cameras, who)
     offset = torch.zeros_like(tensors.intrinsics)
     offset[..., :2, 2] = pixels

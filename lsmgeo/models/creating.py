@@ -1,4 +1,4 @@
-"""Models by name: presets, and the settings that a model keeps."""
+"""Models by name: presets, and the settings of a model."""
 
 from __future__ import annotations
 
@@ -106,8 +106,8 @@ def create(name: str, *, preset: str = "paper", variant: str = "paper", **overri
     Args:
         name: "voxel-lsm", "depth-lsm", "r2n2" or "r2n2-pose".
         preset: "paper" (224 pixels, 32^3 voxels), "compact" (128 pixels, 32^3 voxels, for training on a CPU core
-            in half an hour), "standard" (that of the experiments, which is compact) or "tiny" (32 pixels, 16^3 voxels,
-            for tests).
+            in half an hour), "standard" (that of the experiments, the same as compact) or "tiny" (32 pixels, 16^3
+            voxels, for tests).
         variant: "paper", or "release" for the layers of the released network, of "voxel-lsm" and "depth-lsm" only.
         **overrides: settings by name in place of the preset's, see `VoxelSettings`, `DepthSettings` and `R2N2Settings`;
             of "voxel-lsm" and "depth-lsm" also an `encoder`.
@@ -141,13 +141,10 @@ def create(name: str, *, preset: str = "paper", variant: str = "paper", **overri
 
 
 def settings_of(model: nn.Module) -> dict[str, Any]:
-    """A model's name and settings as a dictionary that JSON can hold.
+    """A model's name and settings as a dictionary that JSON can hold: "name", and every setting by its name.
 
     Args:
         model: from `create`.
-
-    Returns:
-        "name", and every setting by its name.
 
     Raises:
         DTypeError: another module.
@@ -169,9 +166,6 @@ def from_settings(settings: Mapping[str, Any]) -> Model:
 
     Args:
         settings: "name", and settings; missing ones are the paper's.
-
-    Returns:
-        The model.
 
     Raises:
         OptionError: an unknown name or setting, or an invalid value.

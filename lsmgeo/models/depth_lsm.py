@@ -1,6 +1,6 @@
 """D-LSM, a multi-view stereo network from images and cameras to a depth map of each view.
 
-`LSMTrunk`, which is V-LSM's too, then ``PlaneSweepProject -> reduction along rays -> upsampling`` in this file.
+`LSMTrunk`, shared with V-LSM, then ``PlaneSweepProject -> reduction along rays -> upsampling`` in this file.
 """
 
 from __future__ import annotations
@@ -19,13 +19,7 @@ from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_siz
 from lsmgeo.errors import OptionError
 from lsmgeo.grids import VoxelGrid, depth_planes
 from lsmgeo.layers import PlaneSweepProject
-from lsmgeo.models.blocks import (
-    Block,
-    Convolution,
-    InstanceNorm,
-    evaluation_mode,
-    shift_principal_point,
-)
+from lsmgeo.models.blocks import Block, Convolution, InstanceNorm, evaluation_mode, shift_principal_point
 from lsmgeo.models.outputs import DepthOutput, DepthResult
 from lsmgeo.models.settings import DepthSettings, replace_settings
 from lsmgeo.models.voxel_lsm import LSMTrunk
@@ -84,7 +78,7 @@ class DepthLSM(LSMTrunk):
 
     Args:
         settings: `DepthSettings`, whose fields are also keywords; `lsmgeo.models.create` has presets.
-        encoder: an image encoder of your own, as for `VoxelLSM`; needs ``skips=False``, since it has no early maps.
+        encoder: your own image encoder, as for `VoxelLSM`; needs ``skips=False``, since it has no early maps.
 
     Shape:
         - images: (B, V, 3, H, W) in [0, 1]; cameras: B*V, view fastest; view_mask: (B, V).
@@ -134,14 +128,9 @@ class DepthLSM(LSMTrunk):
             )
         else:
             first, second = settings.ray_channels
+            augment = ("depth", "direction")
             self.sweep = ProjectReduce(
-                channels,
-                first,
-                swept,
-                planes,
-                bias=False,
-                mode=settings.projection,
-                augment=("depth", "direction"),
+                channels, first, swept, planes, bias=False, mode=settings.projection, augment=augment
             )
             nn.init.xavier_uniform_(self.sweep.weight)
             self.rays = nn.Sequential(
@@ -172,7 +161,7 @@ class DepthLSM(LSMTrunk):
         Args:
             images: (B, V, 3, H, W) in [0, 1].
             cameras: B*V cameras.
-            view_mask: (B, V) bool; views where it is False are not read, and the answer before them is repeated.
+            view_mask: (B, V) bool; views where it is False are not read, and the prediction before them is repeated.
             steps: after which views: None for all, "last", or their indices.
             target_cameras: B*T cameras to predict the depth of, in place of the images' own; needs ``skips=False``.
 
@@ -195,7 +184,6 @@ class DepthLSM(LSMTrunk):
         if self.settings.pixel_rules == "release":
             # Rays pass the corner of a map's pixels.
             targets = shift_principal_point(self.name, targets, -0.5)
-        views = (B * S, targets.cam_from_world.shape[1])
         size = (images.shape[-2] // self.settings.map_stride, images.shape[-1] // self.settings.map_stride)
         maps, _ = self.sweep(
             grids.flatten(0, 1),
@@ -211,7 +199,7 @@ class DepthLSM(LSMTrunk):
                 x = torch.cat((_repeat(early[level], S).flatten(0, 1).to(x.dtype), x), 1)
             x = block(x)
         with torch.autocast(x.device.type, enabled=False):
-            depth = self.out(x.to(self.out.convolution.weight.dtype)).squeeze(1).unflatten(0, (B, S, views[1]))
+            depth = self.out(x.to(self.out.convolution.weight.dtype)).squeeze(1).unflatten(0, (B, S, -1))
         return DepthOutput(depth if mask is None else torch.where(mask[:, None, :, None, None], depth, 0.0))
 
     def run(

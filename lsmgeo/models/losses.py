@@ -28,14 +28,7 @@ def sum_loss(
     loss: str = "bce",
     steps: str | Sequence[int] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """The loss as a sum and a count, which several processes add up before they divide; see `compute_loss`.
-
-    Args:
-        output: of a model.
-        batch: its input, and the truth.
-        region: see `compute_loss`.
-        loss: see `compute_loss`.
-        steps: see `compute_loss`.
+    """The loss as a sum and a count, which several processes add before they divide; arguments as in `compute_loss`.
 
     Returns:
         The sum of the terms and how many there are, both float32 scalars; only the sum is differentiable.
@@ -47,9 +40,9 @@ def sum_loss(
         >>> import torch
         >>> from lsmgeo.data import Batch
         >>> from lsmgeo.models import VoxelOutput
-        >>> there = torch.tensor([[True, True], [True, False]])
-        >>> solid = torch.ones(2, 4, 4, 4, dtype=torch.bool)
-        >>> batch = Batch(torch.zeros(2, 2, 3, 8, 8), None, None, None, solid, (), (), (), there)
+        >>> view_mask = torch.tensor([[True, True], [True, False]])
+        >>> occupied = torch.ones(2, 4, 4, 4, dtype=torch.bool)
+        >>> batch = Batch(torch.zeros(2, 2, 3, 8, 8), None, None, None, occupied, (), (), (), view_mask)
         >>> sum_loss(VoxelOutput(torch.zeros(2, 2, 4, 4, 4)), batch)[1]  # three views of 64 voxels
         tensor(192.)
     """
@@ -71,14 +64,14 @@ def sum_loss(
     after = views_used(who, steps, batch.view_mask.shape[1])
     if predicted.shape[1] != len(after):
         raise ShapeError(f"{who}: output must be after {len(after)} views; got {tuple(predicted.shape)}")
-    # After the last view every scene has an answer, also where its own last view is padding.
-    has_answer = batch.view_mask.any(1, keepdim=True) if steps == "last" else batch.view_mask[:, after]
-    weight = has_answer.float()[:, :, None, None, None]
+    # After the last view every scene has a prediction, even where its own last view is padding.
+    is_predicted = batch.view_mask.any(1, keepdim=True) if steps == "last" else batch.view_mask[:, after]
+    weight = is_predicted.float()[:, :, None, None, None]
     if isinstance(output, DepthOutput):
         is_object = truth > 0 if batch.mask is None else (truth > 0) & batch.mask
         counted = is_object if region == "object" else torch.ones_like(is_object)
         weight = weight * (counted & batch.view_mask[:, :, None, None])[:, None]
-    # Left out by choice and not by product, before and after: 0 times NaN or infinity is NaN, also in gradients.
+    # Selected before and after, not multiplied by 0: 0 times NaN or infinity is NaN, in gradients too.
     counts = weight > 0
     predicted = torch.where(counts, predicted.float(), 0.0)
     if isinstance(output, VoxelOutput):
@@ -89,7 +82,7 @@ def sum_loss(
     total = torch.where(counts, terms, 0.0).sum()
     if isinstance(output, VoxelOutput) and loss == "bce+iou":
         # The overlap with an empty shape is 0 whatever is predicted.
-        is_counted = has_answer & truth.flatten(1).any(1, keepdim=True)
+        is_counted = is_predicted & truth.flatten(1).any(1, keepdim=True)
         missing = torch.where(is_counted, 1 - _soft_iou(predicted, target), 0.0)
         total = total + IOU_WEIGHT * truth.shape[1:].numel() * missing.sum()
     return total, weight.expand(terms.shape).sum()
@@ -115,16 +108,16 @@ def compute_loss(
     Equation: binary cross-entropy of occupancy; absolute error of depth (Kar, Haene and Malik, "Learning a Multi-View
     Stereo Machine", 2017, section 3). "bce+iou" adds ``0.1 (1 - sum p t / sum (p + t - p t))`` of each scene and view
     (the overlap of Rahman and Wang, "Optimizing Intersection-Over-Union in Deep Neural Networks", 2016), p the
-    probabilities and t the truth: few voxels are solid, and cross-entropy by itself is slow to leave "all empty".
-    In float32 whatever the output's dtype.
+    probabilities and t the truth: few voxels are occupied, and cross-entropy by itself is slow to leave "all empty".
+    Computed in float32, whatever the output's dtype.
 
     Args:
         output: of a model.
-        batch: what it was fed with, with `occupancy` of the output's resolution, or `depth`.
+        batch: its input, with `occupancy` of the output's resolution, or `depth`.
         region: of depth maps: "object" for the pixels on the object, "all" for every pixel of the unmasked views, with
             the background 10 units away (the release's).
         loss: of occupancy: "bce", the paper's, or "bce+iou".
-        steps: what the model was called with. Masked views do not count.
+        steps: as in the call of the model. Masked views do not count.
 
     Returns:
         A scalar, float32; 0 where nothing counts.
@@ -136,8 +129,8 @@ def compute_loss(
         >>> import torch
         >>> from lsmgeo.data import Batch
         >>> from lsmgeo.models import VoxelOutput
-        >>> there, solid = torch.ones(1, 2, dtype=torch.bool), torch.ones(1, 4, 4, 4, dtype=torch.bool)
-        >>> batch = Batch(torch.zeros(1, 2, 3, 8, 8), None, None, None, solid, (), (), (), there)
+        >>> view_mask, occupied = torch.ones(1, 2, dtype=torch.bool), torch.ones(1, 4, 4, 4, dtype=torch.bool)
+        >>> batch = Batch(torch.zeros(1, 2, 3, 8, 8), None, None, None, occupied, (), (), (), view_mask)
         >>> compute_loss(VoxelOutput(torch.zeros(1, 2, 4, 4, 4)), batch)  # log 2
         tensor(0.6931)
     """

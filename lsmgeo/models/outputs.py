@@ -1,4 +1,4 @@
-"""What the models return, and after which views."""
+"""The outputs of the models, and the views after which they predict."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["DepthOutput", "DepthResult", "VoxelOutput", "VoxelResult", "views_us
 
 
 class VoxelOutput(NamedTuple):
-    """What a voxel network gives in training.
+    """The output of a voxel network in training.
 
     Attributes:
         logits: (B, S, D, H, W); their sigmoid is the probability that a voxel is occupied, after S of the views.
@@ -24,7 +24,7 @@ class VoxelOutput(NamedTuple):
 
 
 class DepthOutput(NamedTuple):
-    """What a depth network gives in training.
+    """The output of a depth network in training.
 
     Attributes:
         depth: (B, S, T, H, W) camera z of T views in world units, after S of the views; 0 in masked views.
@@ -34,7 +34,7 @@ class DepthOutput(NamedTuple):
 
 
 class VoxelResult(NamedTuple):
-    """What `run` of a voxel network gives.
+    """The result of `run` of a voxel network.
 
     Attributes:
         occupancy: (B, D, H, W) probabilities in [0, 1], after all views.
@@ -46,7 +46,7 @@ class VoxelResult(NamedTuple):
 
 
 class DepthResult(NamedTuple):
-    """What `run` of a depth network gives.
+    """The result of `run` of a depth network.
 
     Attributes:
         depth: (B, T, H, W) camera z of T views in world units, after all views; 0 in masked views.
@@ -62,11 +62,8 @@ def views_used(who: str, steps: str | Sequence[int] | None, views: int) -> list[
 
     Args:
         who: the network, named in errors.
-        steps: None for after every view, "last", or indices from 0 to V - 1.
+        steps: None for every view, "last", or indices from 0 to V - 1.
         views: V.
-
-    Returns:
-        S indices.
 
     Raises:
         OptionError: none of these, or an index out of range.

@@ -64,7 +64,7 @@ class R2N2Settings:
         who = type(self).__name__
         check_settings(who, self, features=(1, 1 << 16), pose_features=(1, 1 << 16), coarse=(1, 64), upsample=(1, 4))
         if len(self.decoder) < 2:
-            raise OptionError(f"{who}: decoder must be two whole numbers at least; got {self.decoder}")
+            raise OptionError(f"{who}: decoder must be at least two integers; got {self.decoder}")
         if len(self.shortcuts) != len(self.channels):
             raise OptionError(f"{who}: shortcuts must be one for each of channels; got {self.shortcuts}")
         for before, after, shortcut in zip((3, *self.channels), self.channels, self.shortcuts, strict=False):
@@ -119,7 +119,7 @@ class _GridBlock(nn.Module):
 
 
 class _LastBlock(nn.Module):
-    """A convolution, the sum of two of its output, and one to two classes."""
+    """A convolution, the sum of two convolutions of its output, and a convolution to two classes."""
 
     def __init__(self, before: int, channels: int, upsample: int) -> None:
         super().__init__()
@@ -243,7 +243,7 @@ class R2N2(VoxelModel):
         Args:
             images: (B, V, 3, H, W) in [0, 1].
             cameras: B*V cameras, read only with `pose`.
-            view_mask: (B, V) bool; views where it is False are not read, and the answer before them is repeated.
+            view_mask: (B, V) bool; views where it is False are not read, and the prediction before them is repeated.
             steps: after which views: None for all, "last", or their indices.
 
         Returns:
@@ -268,7 +268,7 @@ class R2N2(VoxelModel):
         return repr(self.settings)
 
     def _check(self, images: Tensor, view_mask: Tensor | None) -> Tensor:
-        """Check images and mask; the mask, all True where none is given."""
+        """Check images and mask; returns the mask, by default all True."""
         expected = f"(B, V, 3, {self.image_size}, {self.image_size}), the model's image size"
         check_float(self.name, "images", images, expected, 5)
         if tuple(images.shape[2:]) != (3, self.image_size, self.image_size) or images.shape[1] < 1:

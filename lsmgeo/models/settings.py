@@ -29,12 +29,12 @@ Limits = tuple[float, float]
 def check_settings(who: str, settings: Any, whole: Limits = (1, LARGEST_SIDE), **limits: Limits) -> None:
     """Require that settings are of their annotated types and within limits.
 
-    Lists, as JSON has them, become tuples, and whole numbers real ones, where the annotation says so.
+    Where the annotation says so, lists (from JSON) become tuples, and integers floats.
 
     Args:
         who: named in errors.
-        settings: a dataclass whose fields are text, choices of it, flags, numbers, tuples, mappings or None.
-        whole: the least and the largest whole number, unless `limits` says otherwise. Real numbers are positive.
+        settings: a dataclass whose fields are text, literals, flags, numbers, tuples, mappings or None.
+        whole: the least and the largest integer, unless `limits` says otherwise. Floats are positive.
         limits: by the names of settings, the least and the largest number.
 
     Raises:
@@ -74,7 +74,7 @@ def _convert(value: Any, kind: Any, least: float, most: float) -> Any:
     elif kind in (str, bool, NoneType) and isinstance(value, kind):
         return value
     elif kind in NUMBERS and isinstance(value, NUMBERS[kind]) and not isinstance(value, bool):
-        # An int of any length is below infinity.
+        # An int of any length compares as below infinity.
         if least <= value <= min(most, sys.float_info.max):
             return kind(value)
     raise TypeError
@@ -92,25 +92,24 @@ class TrunkSettings:
 
     Attributes:
         variant: "paper" or "release", see the models.
-        image_size: side in pixels of the square images that it is meant for; other sizes work.
+        image_size: side in pixels of the square images that it is made for; other sizes work.
         grid_size: voxels along a side of the grid on which views are fused.
         encoder_channels: of the image encoder's levels, each of half the size of the one before.
         feature_channels: of the features that are unprojected.
         feature_stride: pixels of the image to a pixel of the features, a power of 2.
-        lift: samples of the features along a side of a voxel, whose values become channels of that voxel: a cheap way
-            to detail finer than the grid on which views are fused. Depth and direction are appended once a voxel.
-        fusion: "gru" or "lstm", see `lsmgeo.fusion`, or "mean", "variance" or "max", which learn nothing.
+        lift: samples of the features along a side of a voxel, which become channels of that voxel: a cheap way to
+            detail finer than the grid on which views are fused. Depth and direction are appended once per voxel.
+        fusion: "gru" or "lstm", see `lsmgeo.fusion`, or "mean", "variance" or "max", which have no weights.
         input_kernel: side in voxels of the recurrence's kernels over a view's features.
         state_kernel: of those over its state.
         hidden_channels: of the recurrence's state.
-        grid_channels: of the grid network's levels; 64^3 grids take a fourth of 256.
+        grid_channels: of the grid network's levels; 64^3 grids need a fourth, 256.
         output_channels: of the grid network's last layer.
-        pixel_rules: "exact", or "release" for the rules of the released code, which are off: pixel j of the features is
-            taken to lie at j times their stride, (stride - 1) / 2 pixels of the image off; and in D-LSM only, rays
-            of the swept maps pass the corners of pixels, and read voxels half a voxel back. It shows what correct
-            geometry is worth.
+        pixel_rules: "exact", or "release" for the inexact rules of the released code: pixel j of the features lies at
+            j times their stride, which is (stride - 1) / 2 image pixels off; and in D-LSM, rays of the swept maps pass
+            the corners of pixels and read half a voxel back. The difference shows what correct geometry is worth.
         grid_skip: whether the fused grid is appended to the grid network's output; neither the paper nor the release
-            has this skip, which small networks need: nothing else carries detail of the grid's own size.
+            has this skip. Small networks need it: nothing else carries detail at the grid's own resolution.
     """
 
     variant: Literal["paper", "release"] = "paper"
@@ -155,13 +154,13 @@ class TrunkSettings:
         if self.image_size % self.image_stride or self.image_size < 2 * self.image_stride:
             raise OptionError(
                 f"{who}: image_size must be a multiple of {self.image_stride}, 2 to the number of encoder_channels, "
-                f"and twice that at least; got {self.image_size}"
+                f"and at least twice that; got {self.image_size}"
             )
         coarsest = 1 << len(self.grid_channels)
         if self.grid_size % coarsest or self.grid_size < 2 * coarsest:
             raise OptionError(
-                f"{who}: grid_size must be a multiple of {coarsest}, 2 to the number of grid_channels, and twice that "
-                f"at least; got {self.grid_size}"
+                f"{who}: grid_size must be a multiple of {coarsest}, 2 to the number of grid_channels, and at "
+                f"least twice that; got {self.grid_size}"
             )
         self._check_stride("feature_stride")
 
@@ -199,8 +198,8 @@ class DepthSettings(TrunkSettings):
         map_stride: pixels of the image to a pixel of the swept maps, a power of 2.
         projection: "nearest" or "trilinear".
         ray_channels: of the two layers that reduce the features along a ray; the release has only the first.
-        skips: whether the depth layers read the image encoder's early maps too; without, the depth of views whose
-            images are not given can be predicted.
+        skips: whether the depth layers also read the image encoder's early maps; without them, depth can be predicted
+            for views without an image.
     """
 
     near: float = 1.0

@@ -41,7 +41,7 @@ class ImageEncoder(nn.Module):
     """A 2D UNet from images to features: strided convolutions, transposed convolutions, skips between maps of one size.
 
     Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017, section 3, with the widths of their release.
-    Of 224 pixels at stride 2: 32 @ 112, 64 @ 56, 128 @ 28, 256 @ 14; up 128 @ 28, 64 @ 56, 32 @ 112; features 32 @ 112.
+    At 224 pixels, stride 2: 32 @ 112, 64 @ 56, 128 @ 28, 256 @ 14; up 128 @ 28, 64 @ 56, 32 @ 112; features 32 @ 112.
 
     Args:
         settings: of the network.
@@ -154,7 +154,7 @@ class LSMTrunk(Model):
         super().__init__()
         is_release = settings.variant == "release"
         self.image_size = settings.image_size
-        # The release takes pixel j of a map at j times its stride, which shifts the image by so many pixels.
+        # The release places pixel j of a map at j times its stride, which shifts the image by this many pixels.
         self.lift_offset = (settings.feature_stride - 1) / 2 if settings.pixel_rules == "release" else 0.0
         self.resolution = settings.grid_size
         self.grid = VoxelGrid(settings.grid_size)
@@ -204,7 +204,7 @@ class LSMTrunk(Model):
         return TrunkOutput(grids, tuple(item.unflatten(0, views) for item in maps))
 
     def _features(self, images: Tensor) -> Encoded:
-        """Features of images (N, 3, H, W), which an encoder from outside gives without early maps."""
+        """Features of images (N, 3, H, W); early maps come only from `ImageEncoder`."""
         encoded = self.image_encoder(images)
         if isinstance(encoded, Encoded):
             return encoded
@@ -223,7 +223,7 @@ class LSMTrunk(Model):
         return torch.stack([self.fusion(volume[:, :n], visible[:, :n], mask[:, :n]) for n in (i + 1 for i in after)], 1)
 
     def _unproject(self, features: Tensor, cameras: Cameras, view_mask: Tensor | None) -> Unprojected:
-        """The volume (B, V, C, D, H, W) of every view and where it sees: samples by sub-voxel, depth and direction."""
+        """Volumes (B, V, C, D, H, W) and visibility of the views: samples by sub-voxel, depth and direction."""
         if self.lift_offset:
             cameras = shift_principal_point(self.name, cameras, self.lift_offset)
         if self.unproject_finely is None:
@@ -237,7 +237,7 @@ class LSMTrunk(Model):
     def _check(self, images: Tensor, view_mask: Tensor | None) -> int:
         """Check images and mask; the number of views."""
         stride = self.image_stride
-        expected = f"(B, V, 3, H, W), V at least 1, H and W multiples of {stride}, {2 * stride} at least"
+        expected = f"(B, V, 3, H, W), V at least 1, H and W multiples of {stride}, at least {2 * stride}"
         check_float(self.name, "images", images, expected, 5)
         _, V, channels, height, width = images.shape
         if V < 1 or channels != 3 or height % stride or width % stride or min(height, width) < 2 * stride:
@@ -264,7 +264,7 @@ class VoxelLSM(LSMTrunk, VoxelModel):
 
     Args:
         settings: `VoxelSettings`, whose fields are also keywords; `lsmgeo.models.create` has presets.
-        encoder: an image encoder of your own: a module from images (N, 3, H, W) to features (N, C, h, w) that cover the
+        encoder: your own image encoder: a module from images (N, 3, H, W) to features (N, C, h, w) that cover the
             image, with C = ``feature_channels``. Images may then be of any size. `write_weights` refuses such a model,
             since `load` could not build it: save its ``state_dict``.
 
@@ -315,7 +315,7 @@ class VoxelLSM(LSMTrunk, VoxelModel):
         Args:
             images: (B, V, 3, H, W) in [0, 1].
             cameras: B*V cameras.
-            view_mask: (B, V) bool; views where it is False are not read, and the answer before them is repeated.
+            view_mask: (B, V) bool; views where it is False are not read, and the prediction before them is repeated.
             steps: after which views: None for all, "last", or their indices.
 
         Returns:

@@ -69,7 +69,7 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """What a file of weights holds.
+    """The content of a file of weights.
 
     Args:
         path: the file.
@@ -91,8 +91,8 @@ def write_weights(
 
     Args:
         path: the file, by convention ``.safetensors``.
-        model: from `create`. A model that `load` could not build from its settings (with an encoder or a layer of your
-            own, in float64, ...) is refused: save its ``state_dict`` with `torch.save`.
+        model: from `create`. A model that `load` could not build from its settings (with your own encoder or layer, in
+            float64, ...) is refused: save its ``state_dict`` with `torch.save`.
         about: notes to keep with the weights, in types that JSON has.
         half: whether float32 weights are kept as float16, in half the space; `load` converts them to float32.
 
@@ -129,7 +129,7 @@ def load(path: str | os.PathLike[str]) -> Model:
         The model, on the CPU, in evaluation mode; its `about` are the notes kept with the weights.
 
     Raises:
-        CheckpointError: there is no such file, it is damaged, or it does not hold what its settings describe.
+        CheckpointError: there is no such file, it is damaged, or its content does not match its settings.
     """
     weights = read_weights(path)
     model = _build(weights)
@@ -179,7 +179,7 @@ def newest_checkpoint(path: Path, read: Callable[[Path], Found], problems: Seque
         problems: problems that are already known.
 
     Returns:
-        What `read` returns, or None where nothing was ever saved.
+        The result of `read`, or None where nothing was ever saved.
 
     Raises:
         CheckpointError: there are checkpoints, and none verifies; or the newest is of a newer format.
@@ -202,24 +202,12 @@ def newest_checkpoint(path: Path, read: Callable[[Path], Found], problems: Seque
 
 
 def step_folder(step: int) -> str:
-    """The name of a step's checkpoint.
-
-    Args:
-        step: its number.
-
-    Example:
-        >>> step_folder(100)
-        'step_00000100'
-    """
+    """The name of a step's checkpoint, such as "step_00000100"."""
     return f"step_{step:08d}"
 
 
 def checkpoint_folders(path: Path) -> dict[int, Path]:
-    """The finished checkpoints in a run folder, or in its folder of checkpoints, by step, the newest first.
-
-    Args:
-        path: either folder; it need not exist.
-    """
+    """The finished checkpoints in a run folder, or in its folder of checkpoints, by step, newest first; {} if none."""
     folder = path / CHECKPOINTS if (path / CHECKPOINTS).is_dir() else path
     found: dict[int, Path] = {}
     # The longer names first: a checkpoint takes precedence over the one that it replaces.
@@ -231,19 +219,7 @@ def checkpoint_folders(path: Path) -> dict[int, Path]:
 
 
 def encode_weights(model: nn.Module, *, about: Mapping[str, Any] | None = None, half: bool = False) -> bytes:
-    """The bytes of a file of weights.
-
-    Args:
-        model: from `create`.
-        about: notes to keep with the weights, in types that JSON has.
-        half: see `write_weights`.
-
-    Returns:
-        The content of a safetensors file.
-
-    Raises:
-        DTypeError, OptionError: see `write_weights`.
-    """
+    """The bytes of a file of weights; arguments and errors as in `write_weights`."""
     settings, tensors = settings_of(model), tensors_of(model)
     if check_flag("write_weights", "half", half):
         tensors = {name: tensor.half() if tensor.dtype == torch.float32 else tensor for name, tensor in tensors.items()}
@@ -283,18 +259,7 @@ def tensors_of(model: nn.Module) -> dict[str, Tensor]:
 
 
 def parse_weights(content: bytes, path: Path) -> Weights:
-    """Read the bytes of a file of weights.
-
-    Args:
-        content: the whole file.
-        path: its path, for messages.
-
-    Returns:
-        Settings, notes and tensors.
-
-    Raises:
-        CheckpointError: it is not such a file, or damaged.
-    """
+    """Parse the content of a file of weights; a CheckpointError with its path where it is damaged, or no such file."""
     length = int.from_bytes(content[:8], "little")
     if len(content) < 8 or length > min(len(content) - 8, MAX_HEADER_BYTES):
         raise CheckpointError(path, "is not a whole file of weights (safetensors)")
@@ -305,7 +270,7 @@ def parse_weights(content: bytes, path: Path) -> Weights:
             raise CheckpointError(path, f"is of format {metadata['format'][:64]!r}; this version reads {FORMAT!r}")
         if len(header) > MAX_TENSORS:
             raise CheckpointError(path, f"holds {len(header)} tensors, the limit is {MAX_TENSORS}")
-        # It refuses tensors whose bytes do not follow each other to the end of the file, as their shapes say.
+        # It rejects tensors whose shapes do not fill the file exactly, one after another.
         tensors = safetensors.torch.load(content)
         settings, about = json.loads(metadata["settings"]), json.loads(metadata["about"])
         if metadata.pop("sha256") != checksum(metadata, tensors):
@@ -318,18 +283,7 @@ def parse_weights(content: bytes, path: Path) -> Weights:
 
 
 def read_file(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
-    """The bytes of a plain file.
-
-    Args:
-        path: the file.
-        limit: the largest size accepted.
-
-    Returns:
-        All of them.
-
-    Raises:
-        CheckpointError: it is missing, not a plain file, unreadable, or too large.
-    """
+    """All bytes of a plain file; a CheckpointError where it is missing, unreadable, or larger than `limit`."""
     try:
         return read_bytes(path, limit)
     except DataError as error:
@@ -337,15 +291,7 @@ def read_file(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
 
 
 def fill_model(model: nn.Module, weights: Weights) -> None:
-    """Copy tensors into a model.
-
-    Args:
-        model: to fill.
-        weights: from `read_weights`.
-
-    Raises:
-        CheckpointError: a tensor is missing, unknown, or of another shape or dtype; the message names it.
-    """
+    """Copy tensors into a model; a CheckpointError names one that is missing, unknown, or of another shape or dtype."""
     _check_fit(model, weights)
     model.load_state_dict(dict(weights.tensors))
 
@@ -355,8 +301,8 @@ def _read(path: Path) -> Weights:
 
 
 def _build(weights: Weights) -> Model:
-    """The model that weights are of, whose parameters have no memory yet."""
-    # A file whose settings do not match its content must not allocate what they describe.
+    """The model of these weights; its parameters have no memory yet."""
+    # Settings that do not match the file's content must not allocate memory.
     with _WithoutMemory(), torch.random.fork_rng(devices=[]):
         try:
             model = from_settings(dict(weights.settings))

@@ -1,4 +1,4 @@
-"""Training: a loop that is read from top to bottom, what it is configured with and fed with, and what it keeps."""
+"""Training: the loop, its configuration and batches, checkpoints and the log."""
 
 from lsmgeo.training.config import (
     DataConfig,

@@ -78,7 +78,7 @@ def open_shapes(
         device: where synthetic shapes are rendered.
         views: how many views of each shape; by default those of the configuration.
         is_training: training takes `split`, `categories` and pose noise; evaluation `validation_split` and
-            `validation_categories`, without skipping of shapes and without pose noise.
+            `validation_categories`, skips no shapes and adds no pose noise.
         folder: of the run, where ``bad_samples.jsonl`` lists the skipped shapes; by default beside the shards.
 
     Raises:
@@ -205,7 +205,7 @@ def training_batches(
         seed: of the order.
         start: samples that all processes together have taken before.
         batch: samples of a batch.
-        workers: processes that read ahead; 0 reads when a batch is needed.
+        workers: processes that prefetch; 0 reads in this process when a batch is needed.
         device: of the batches.
         rank: of this process.
         processes: how many there are.
@@ -225,9 +225,9 @@ def validation_batches(
     rank: int = 0,
     processes: int = 1,
 ) -> Generator[Batch, None, None]:
-    """Batches of always the same `count` shapes, or all, with the same views, each shape in one process.
+    """Batches of at most `count` shapes, always the same with the same views, each in one process.
 
-    Close them, too; the other arguments are those of `training_batches`.
+    Close them too; the other arguments are those of `training_batches`.
     """
     order = EpochSampler(len(shapes), seed=seed).order(0)[:count][rank::processes].tolist()
     chunks = [[(0, index) for index in order[first : first + batch]] for first in range(0, len(order), batch)]

@@ -55,7 +55,7 @@ class Checkpoint:
     Args:
         path: its folder.
         step: how many steps had been taken.
-        config: the configuration of the run that saved it.
+        config: of the run that saved it.
         best: the step of the best checkpoint at that time, if any.
         weights: the model's tensors and settings.
         state: everything else by name: optimiser, guard, progress of the run, ...
@@ -130,10 +130,10 @@ def save_checkpoint(
                 write_atomic(made / name, content)
     except DataError as error:
         raise CheckpointError(final, error.reason) from error
-    # The checkpoint is written; the next one makes up for what fails from here on.
+    # The checkpoint is written; the next save makes up for failures from here on.
     try:
         write_atomic(folder / LATEST, f"{final.name}\n".encode())
-        # Those of later steps are damaged, or this run would have resumed from them; it replaces them later.
+        # Checkpoints of later steps are damaged, or this run would have resumed from them; it replaces them later.
         for number in [number for number in checkpoint_folders(folder) if number <= step][keep:]:
             if number != best:
                 remove_folder(folder / step_folder(number))
@@ -170,7 +170,7 @@ def check_config(checkpoint: Checkpoint, config: Mapping[str, Any], *, free: Col
     Args:
         checkpoint: to resume from.
         config: of this run, as for `save_checkpoint`.
-        free: dotted names of what may differ, for example "run.steps".
+        free: dotted names of settings that may differ, such as "run.steps".
 
     Raises:
         CheckpointError: another value is different, missing or new; the message names the first.
@@ -187,7 +187,7 @@ def _encode_state(state: Mapping[str, Any]) -> bytes:
     buffer = io.BytesIO()
     torch.save(dict(state), buffer)
     try:
-        # Find out now, and not after a loss of power, what cannot be read back.
+        # Fail now, and not after a loss of power, where it cannot be read back.
         torch.load(io.BytesIO(buffer.getvalue()), weights_only=True)
     except Exception as error:
         reason = str(error)[:400]

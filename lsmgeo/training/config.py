@@ -61,11 +61,11 @@ class DataConfig:
         split: the split of the set for training.
         validation_split: the split for evaluation.
         validation_categories: as `categories`; None for the same.
-        limit: at most so many shapes of each split; None for all.
-        pose_noise: cameras are rotated about the object by up to so many degrees, in training only.
-        workers: processes that read ahead; 0 reads in the training loop.
-        on_error: "raise" at a shape that cannot be read, or "skip" it, see `lsmgeo.data.ShapeDataset`.
-        max_bad_fraction: the largest share of such shapes that "skip" allows.
+        limit: the largest number of shapes of each split; None for all.
+        pose_noise: largest random rotation of the cameras about the object, in degrees, in training only.
+        workers: processes that prefetch; 0 reads in the training loop.
+        on_error: "raise" where a shape cannot be read, or "skip" it, see `lsmgeo.data.ShapeDataset`.
+        max_bad_fraction: the largest share of skipped shapes.
     """
 
     source: str = "synthetic-13"
@@ -109,8 +109,8 @@ class OptimiserConfig:
         betas: of Adam.
         weight_decay: of AdamW; 0 is Adam.
         schedule: "constant", or "cosine", down to 0 at ``run.steps``.
-        warm_up: the learning rate grows linearly over so many steps.
-        clip_norm: gradients of a larger norm are scaled down to it; None never.
+        warm_up: steps over which the learning rate grows linearly.
+        clip_norm: gradients of a larger norm are scaled down to it; None for no clipping.
     """
 
     learning_rate: float = 1e-3
@@ -131,33 +131,32 @@ class RunConfig:
     """How long and how to train, and what to keep.
 
     Attributes:
-        steps: the run ends after so many steps; None for no such end.
-        minutes: or after so many minutes of training, over all resumes; None for no such end.
-        cpu_minutes: where `steps` is None, the run ends after so many minutes of the process's CPU time, its
-            evaluations included. The first 30 steps are timed, and the number of steps is computed once: it is `steps`
-            from then on, in ``config.json`` and whenever the run is resumed, so that a schedule counts steps. A cosine
-            begins after these 30. The time of reading workers is not counted. `steps` takes precedence.
+        steps: the number of steps; None for no limit.
+        minutes: the largest training time, over all resumes; None for no limit.
+        cpu_minutes: where `steps` is None, the CPU time of the process, evaluations included. The first 30 steps are
+            timed, and `steps` is computed once, for ``config.json``, the schedule and every resumption. A cosine begins
+            after these 30. The time of workers is not counted.
         seed: of the weights, of the order of the shapes and of their views.
         batch: shapes per batch and process.
         accumulation: batches per step: a step takes batch x accumulation x processes shapes.
         device: "auto" is a GPU where there is one; or "cpu".
         precision: "no", "bf16" or "fp16": of mixed precision (weights stay float32). "auto" is bf16 where the hardware
             multiplies it faster (GPUs with bf16, CPUs with AMX), chosen once for the run.
-        channels_last: whether feature maps are channels-last in memory; None where it is faster for the network.
+        channels_last: whether feature maps are channels-last in memory; None to choose the faster for the network.
         loss: of voxels: "bce", the paper's cross-entropy, or "bce+iou", see `lsmgeo.models.compute_loss`.
-        loss_views: the loss is taken after "every" view, after a "random" one (later views are not read, and of depth
-            that of the views so far counts), or only after the "last".
+        loss_views: the loss is computed after "every" view, after a "random" one (later views are not read, and have
+            no loss of depth), or only after the "last".
         region: of depth, the pixels of the loss: the "object", or "all" with the background far away.
-        evaluate_every: steps between evaluations; the end is always evaluated.
-        evaluate_shapes: how many shapes of the validation split, always the same.
-        evaluate_views: how many views of each, always the same; None for the largest number in training.
+        evaluate_every: steps between evaluations; the last step is always evaluated.
+        evaluate_shapes: number of shapes of the validation split, always the same.
+        evaluate_views: number of views of each, always the same; None for the largest number in training.
         pictures: how many of these shapes are drawn after each evaluation.
-        checkpoint_every: steps between checkpoints; the end is always saved.
-        keep: how many checkpoints are kept, besides the best.
+        checkpoint_every: steps between checkpoints; the last step is always saved.
+        keep: number of checkpoints kept besides the best.
         log_every: steps between lines of the log.
-        tensorboard: whether to write for TensorBoard too.
-        max_bad_steps: the run stops after so many steps in a row whose loss or gradient is not finite.
-        max_bad_fraction: and where more than this share of all steps was.
+        tensorboard: whether to write TensorBoard files too.
+        max_bad_steps: the run stops after this many steps in a row whose loss or gradient is not finite.
+        max_bad_fraction: the run stops where such steps are more than this share of all.
     """
 
     steps: int | None = None
@@ -189,7 +188,7 @@ class RunConfig:
             raise OptionError("run: steps, minutes or cpu_minutes must say when the run ends; got none")
 
 
-# What a resumed run may change: nothing that affects the result of a step.
+# Settings that a resumed run may change: none affects the result of a step.
 FREE = (
     *("data.source", "data.workers", "data.on_error", "data.max_bad_fraction", "model.weights"),
     *("run.steps", "run.minutes", "run.device", "run.evaluate_every", "run.evaluate_shapes", "run.evaluate_views"),
@@ -237,7 +236,7 @@ class TrainingConfig:
 
     def free(self) -> tuple[str, ...]:
         """The settings that may change when a run is resumed, by their dotted names."""
-        # The learning rate of a cosine depends on where it ends.
+        # A cosine's learning rate depends on the number of steps.
         is_fixed = self.optimiser.schedule == "cosine"
         return tuple(name for name in FREE if not (is_fixed and name == "run.steps"))
 
@@ -314,7 +313,7 @@ def read_config(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> 
 
 
 def _parsed(text: str) -> Any:
-    """A value as TOML writes it; anything else is text."""
+    """A TOML value; anything else is text."""
     if text.lower() == "none":
         return None
     try:

@@ -1,4 +1,4 @@
-"""Predictions beside the truth, as one image for the log."""
+"""Predictions beside the ground truth, as one image for the log."""
 
 from __future__ import annotations
 

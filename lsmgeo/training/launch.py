@@ -1,6 +1,6 @@
-"""Start and stop of a run: devices, the model, signals, and what several processes agree on.
+"""Start and stop of a run: devices, the model, signals, agreement of processes.
 
-A signal sets a flag, and training ends where nothing is lost.
+A signal sets a flag, and training ends at the next point where nothing is lost.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def fast_precision(device: str) -> str:
 
 @contextlib.contextmanager
 def start_accelerator(run: RunConfig, *, has_idle_parameters: bool) -> Iterator[Accelerator]:
-    """The accelerator of a run, of the processes that `torchrun` started, or of this one.
+    """The accelerator of a run, over the processes that `torchrun` started or this one.
 
     Args:
         run: has device and precision.
@@ -107,7 +107,7 @@ def start_accelerator(run: RunConfig, *, has_idle_parameters: bool) -> Iterator[
 
 @contextlib.contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Lock a run's folder for this process: two that train in it would remove each other's checkpoints.
+    """Lock a run's folder for this process: two processes would remove each other's checkpoints.
 
     Raises:
         TrainingError: another process has locked it.
@@ -124,7 +124,7 @@ def hold_folder(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise DataError(folder, f"cannot be written ({error})") from error
     try:
-        # The process's workers do not inherit this lock; it ends with the process, however that ends.
+        # Workers do not inherit this lock; it ends with the process, also after a kill.
         try:
             fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except (BlockingIOError, PermissionError) as error:
@@ -137,10 +137,10 @@ def hold_folder(folder: Path) -> Iterator[None]:
 
 
 def make_model(config: ModelConfig, run: RunConfig, device: torch.device) -> Model:
-    """The model that is trained, with weights from the seed or from a file.
+    """The model to train, with weights from the seed or from a file.
 
     Raises:
-        OptionError: there is no such model, or the file holds another one.
+        OptionError: there is no such model, or the file is of another one.
         CheckpointError: the file cannot be used.
     """
     torch.manual_seed(run.seed)
@@ -178,7 +178,7 @@ class StopRequest:
         return 0 if self.signal is None else 128 + self.signal
 
     def next_item(self, items: Iterator[Item]) -> Item | None:
-        """The next of ``items``, or None as soon as a stop is asked for, however long the item would take.
+        """The next of ``items``, or None as soon as a stop is requested, however long the item would take.
 
         After None the iterator may be broken: do not use it.
         """
@@ -194,7 +194,7 @@ class StopRequest:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.signal == number:
-            # The second request does not wait; a checkpoint cut off here is as after a loss of power.
+            # A second request ends at once; a checkpoint cut off here is as after a loss of power.
             os._exit(128 + number)
         if self:  # Ctrl-C reaches torchrun too, which then sends SIGTERM to its processes
             return

@@ -31,7 +31,7 @@ SECONDS_BETWEEN_LINES = 30.0
 class RunLog:
     """The log of a run, written by its first process only.
 
-    A full disk does not end the run: the first line that cannot be written gives a warning, and later ones are tried.
+    A full disk does not end the run: the first line that cannot be written gives a warning, and later lines are tried.
 
     Args:
         folder: the run's folder.
@@ -41,15 +41,7 @@ class RunLog:
         quiet: whether to show no progress.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        run: RunConfig,
-        *,
-        step: int,
-        is_writer: bool = True,
-        quiet: bool = False,
-    ) -> None:
+    def __init__(self, folder: Path, run: RunConfig, *, step: int, is_writer: bool = True, quiet: bool = False) -> None:
         self.folder, self.is_writer = folder, is_writer
         self._warned: set[str] = set()
         self._shown = time.monotonic()
@@ -62,7 +54,7 @@ class RunLog:
             self._bar = tqdm(total=run.steps, initial=step, unit="step", dynamic_ncols=True, smoothing=0.05)
 
     def close(self) -> None:
-        """Write the rest."""
+        """Close the progress bar and TensorBoard's files."""
         if self._bar is not None:
             self._bar.close()
         if self._board is not None:
@@ -70,7 +62,7 @@ class RunLog:
                 self._board.close()
 
     def event(self, name: str, **values: Any) -> None:
-        """Append a line of what JSON holds; numbers that are not finite become text."""
+        """Append a line of JSON; numbers that are not finite become text."""
         if not self.is_writer:
             return
         line = json.dumps({"event": name, **_plain(values), "time": round(time.time(), 3)}, allow_nan=False)
@@ -80,12 +72,12 @@ class RunLog:
             self._warn(LOG, f"{self.folder / LOG}: cannot be written ({error}); the run goes on")
 
     def step(self, step: int, *, waited: float, **values: float) -> None:
-        """The line and curves of a step that waited so many seconds for data, with its loss, learning rate, ..."""
+        """Log a step and its curves: seconds `waited` for data, loss, learning rate, ..."""
         self.event("step", step=step, **values, waited=_short(waited))
         self.scalars(step, {f"train/{name}": value for name, value in values.items()})
 
     def evaluation(self, step: int, found: Evaluation, *, seconds: float, best: int | None) -> None:
-        """The line, curves and image of an evaluation after `step` steps; `best` is the step of the best so far."""
+        """Log an evaluation, its curves and image; `best` is the step of the best so far."""
         self.event("evaluation", step=step, **found.fields(), evaluation_seconds=_short(seconds), best=best)
         by_view = {f"{found.measure}/{view}_views": value for view, value in found.by_view.items()}
         by_category = {f"{found.measure}_by_category/{name}": value for name, value in found.categories.items()}
@@ -95,7 +87,7 @@ class RunLog:
             self.image(step, draw_examples(found.examples))
 
     def plan(self, steps: int) -> None:
-        """The number of steps is known."""
+        """Log the planned number of steps."""
         self.event("plan", steps=steps)
         self.say(f"{steps} steps fill the CPU minutes")
         if self._bar is not None:
@@ -119,7 +111,7 @@ class RunLog:
                 self._board.add_image("predicted", image, step, dataformats="HWC")
 
     def progress(self, step: int, text: str) -> None:
-        """Show the progress: at every call on a terminal, elsewhere a line every half minute."""
+        """Show the progress: in the bar of a terminal, elsewhere a line every half minute."""
         if self._bar is not None:
             self._bar.update(step - self._bar.n)
             self._bar.set_postfix_str(text, refresh=False)
@@ -161,14 +153,14 @@ class RunLog:
 
 
 def _append_line(path: Path, line: bytes) -> None:
-    """Append a whole line, or raise and leave the file as it was."""
+    """Append a whole line, or raise and leave the file unchanged."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
     try:
         size = os.fstat(descriptor).st_size
         # A loss of power may have left half a line.
         begin = b"\n" if size and os.pread(descriptor, 1, size - 1) != b"\n" else b""
         content = begin + line + b"\n"
-        if os.write(descriptor, content) < len(content):  # there was room for only a part
+        if os.write(descriptor, content) < len(content):  # the disk is full
             os.ftruncate(descriptor, size)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     finally:
@@ -176,12 +168,12 @@ def _append_line(path: Path, line: bytes) -> None:
 
 
 def _short(value: float) -> float:
-    """Six digits of a time."""
+    """A time rounded to six digits."""
     return float(f"{value:.6g}")
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON holds it."""
+    """A value in JSON types."""
     if isinstance(value, Mapping):
         return {str(key): _plain(one) for key, one in value.items()}
     if isinstance(value, (list, tuple)):

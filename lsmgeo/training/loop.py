@@ -38,10 +38,10 @@ class Trained:
         step: how many steps it has taken.
         checkpoint: of this step.
         best: the step of the best evaluation, None where there was none.
-        evaluation: the last one; None where none was made since the run began or was resumed.
-        ended: "steps", "minutes" or "stop", which is after a signal.
+        evaluation: the last since the run began or was resumed, if any.
+        ended: "steps", "minutes", or "stop" after a signal.
         is_first: whether this is the first process of the run.
-        exit_code: what the process should end with: 0, or 128 plus the signal's number.
+        exit_code: for the process: 0, or 128 plus the signal's number.
     """
 
     folder: Path
@@ -57,9 +57,9 @@ class Trained:
 def train(config: TrainingConfig, out: str | os.PathLike[str], *, quiet: bool = False) -> Trained:
     """Train a model, or resume a run that stopped.
 
-    The folder holds afterwards ``config.json``, ``log.jsonl``, ``tensorboard``, ``pictures`` and ``checkpoints``. A run
-    that is resumed, after a signal or after a kill, ends with the same weights, bit by bit on a CPU, as one that never
-    stopped. With `torchrun`, every process calls this; gradients are as if one process had taken all shapes.
+    The folder then holds ``config.json``, ``log.jsonl``, ``tensorboard``, ``pictures`` and ``checkpoints``. A run that
+    is resumed, after a signal or a kill, ends with the same weights, bit by bit on a CPU, as one that never stopped.
+    With `torchrun`, every process calls this; gradients equal those of one process with all shapes.
 
     Args:
         config: of the run.
@@ -72,14 +72,14 @@ def train(config: TrainingConfig, out: str | os.PathLike[str], *, quiet: bool = 
     Raises:
         OptionError, DataError: settings or data that cannot be used.
         CheckpointError: the folder is another run's, its checkpoints cannot be used, or the last one cannot be written.
-        TrainingError: losses or gradients were not finite again and again; processes start from different states; or
-            another process trains in the folder.
+        TrainingError: losses or gradients were repeatedly not finite; processes start from different states; or another
+            process trains in the folder.
     """
     folder = Path(out)
     found = list(checkpoint_folders(folder))
     checkpoint = load_latest(folder)
     config = resolve_config(config, checkpoint)
-    # One layer of the release never gets a gradient, and what convolves the state gets none from a single view.
+    # One layer of the release never gets a gradient, and convolutions of the state get none from a single view.
     has_idle_parameters = (
         config.model.variant == "release" or config.data.view_range[0] == 1 or config.run.loss_views == "random"
     )
@@ -89,8 +89,8 @@ def train(config: TrainingConfig, out: str | os.PathLike[str], *, quiet: bool = 
     ):
         run = Run(config, folder, checkpoint, accelerator, stop)
         is_first = run.rank == 0
-        # Nothing is written before everything is found to fit. The readers are closed whatever happens: they ignore
-        # the signals with which Python ends its children.
+        # Nothing is written until data, weights and checkpoint fit. The readers are always closed: they ignore the
+        # signals with which Python ends its children.
         with (
             hold_folder(folder) if is_first else contextlib.nullcontext(),
             contextlib.closing(run.open_log(quiet=quiet)),
@@ -108,7 +108,7 @@ def train(config: TrainingConfig, out: str | os.PathLike[str], *, quiet: bool = 
 
 
 def _take_steps(run: Run, batches: Iterator[Batch]) -> str:
-    """Evaluate, plan, save, take a step, until the run ends; why it ended."""
+    """Evaluate, plan, save and take a step until the run ends; returns why it ended."""
     progress, optimiser, accelerator, log, stop = run.progress, run.optimiser, run.accelerator, run.log, run.stop
     rates = run.config.optimiser
     settings, ended = run.config.run, ""
@@ -128,8 +128,8 @@ def _take_steps(run: Run, batches: Iterator[Batch]) -> str:
 
         is_due = ended or plans or progress.step % settings.checkpoint_every == 0 or progress.step == progress.best
         if is_due and not run.is_saved:
-            # The first shows before the work whether the folder can be written. Without a plan that is saved a resumed
-            # run would make another.
+            # The first checkpoint shows early that the folder can be written. A plan that is not saved would be made
+            # again, differently, by a resumed run.
             run.save(must=bool(ended) or plans or progress.step == 0)
         if plans:
             run.write_config()
@@ -139,7 +139,7 @@ def _take_steps(run: Run, batches: Iterator[Batch]) -> str:
             return ended
 
         begun, cpu_begun = run.seconds(), run.cpu_seconds()
-        # None as soon as a stop is asked for.
+        # None as soon as a stop is requested.
         taken = [batch for _ in range(settings.accumulation) if (batch := stop.next_item(batches)) is not None]
         waited = run.seconds() - begun
         if any_true(len(taken) < settings.accumulation or bool(stop)):

@@ -1,4 +1,4 @@
-"""One step of training: gradients of the mean loss over all shapes of all processes, Adam, and the guard of steps."""
+"""A training step: gradients of the mean loss over all shapes of all processes, Adam, and the guard."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ __all__ = [
 ]
 
 Steps = str | Sequence[int] | None  # as the models take them
-# How many steps are timed where CPU minutes limit a run.
+# Steps that are timed where CPU minutes limit a run.
 TIMED_STEPS = 30
-# So many skipped steps are allowed, whatever their share of all steps.
+# Skipped steps that are allowed, whatever their share of all steps.
 FORGIVEN = 5
 
 
@@ -65,8 +65,8 @@ class StepGuard:
     precision must still be updated, or it never lowers its scale.
 
     Args:
-        in_a_row: so many skipped steps in succession end the training; so do more than 5 skipped steps that are ...
-        share: ... more than this share of all steps.
+        in_a_row: this many skipped steps in a row end the training; ...
+        share: ... so do more than 5 skipped steps that are more than this share of all.
 
     Example:
         >>> guard = StepGuard(in_a_row=2)
@@ -118,7 +118,7 @@ are unharmed. Last: step 2 with chair-0; step 3 with lamp-7
         raise TrainingError(reason)
 
     def state_dict(self) -> dict[str, int]:
-        """How many steps were checked, skipped, and skipped in succession."""
+        """Numbers of steps checked, skipped, and skipped in a row."""
         return self._state.copy()
 
     def load_state_dict(self, state: dict[str, int]) -> None:
@@ -155,7 +155,7 @@ def find_gradients(
         accelerator: of the run.
         run: the settings of the loss.
         steps: after which views the loss is taken, see `loss_views_of`.
-        terms: about how many terms a batch has: sums are divided by it, so that gradients have a normal size.
+        terms: about how many terms a batch has; sums are divided by it to give gradients of usual size.
     """
     sums = torch.zeros(2, device=accelerator.device)
     for index, batch in enumerate(batches):

@@ -31,27 +31,27 @@ if TYPE_CHECKING:
 __all__ = ["Progress", "Run"]
 
 CONFIG = "config.json"
-# Of the steps that are timed, the first are slower than the others will be.
+# The first of the timed steps are slower than later ones.
 SLOW_STEPS = 5
 
 
 @dataclass
 class Progress:
-    """How far a run is, the same in all processes; a checkpoint keeps it as "place"."""
+    """The progress of a run, the same in all processes; checkpoints keep it as "place"."""
 
-    step: int = 0  # batches that were taken, also those whose gradient was not finite
+    step: int = 0  # steps taken, including those whose gradient was not finite
     moved: int = 0  # steps that moved the parameters
     seconds: float = 0.0
     cpu_seconds: float = 0.0
     evaluated: int = 0  # the step of the last evaluation
     best: int | None = None
     best_value: float | None = None
-    measured: dict[str, Any] | None = None  # what the last evaluation found
-    timed: list[list[float]] = field(default_factory=list)  # views and CPU seconds of the steps before there is a plan
+    measured: dict[str, Any] | None = None  # by the last evaluation
+    timed: list[list[float]] = field(default_factory=list)  # views and CPU seconds of the steps before the plan
 
 
 class Run:
-    """What one process of a run holds. Construction opens data and weights, restores the checkpoint, writes nothing."""
+    """One process of a run. Construction opens data and weights and restores the checkpoint; it writes nothing."""
 
     log: RunLog  # from `open_log` on
 
@@ -67,7 +67,7 @@ class Run:
         self.config, self.folder, self.checkpoint = config, folder, checkpoint
         self.accelerator, self.stop = accelerator, stop
         self.rank, self.processes = accelerator.process_index, accelerator.num_processes
-        # A resumed run has its weights.
+        # A resumed run has its own weights.
         self.model = make_model(
             config.model if checkpoint is None else replace(config.model, weights=None), settings, device
         )
@@ -108,23 +108,23 @@ class Run:
             checkpoint.restore("scaler", self.accelerator.scaler)
         self.progress = Progress(**checkpoint.part("place"))
         if any(before[key] != getattr(settings, key) for key in ("evaluate_shapes", "evaluate_views")):
-            # Measures on other shapes or views do not compare with those that come.
+            # Measures on other shapes or views are not comparable.
             self.progress.best = self.progress.best_value = None
         self.saved, self.is_saved = checkpoint.path, True
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What a resumed run must agree with, and all processes of a run."""
+        """Settings and data that must be the same in all processes and when a run is resumed."""
         return {**self.config.to_dict(), "processes": self.processes, "shapes": self.shapes.identity}
 
     @property
     def shapes_per_step(self) -> int:
-        """How many shapes all processes take in a step."""
+        """The number of shapes per step, over all processes."""
         return self.config.run.batch * self.config.run.accumulation * self.processes
 
     @property
     def evaluated_shapes(self) -> int:
-        """How many shapes an evaluation takes."""
+        """The number of shapes per evaluation."""
         return min(self.config.run.evaluate_shapes, len(self.held_back))
 
     def seconds(self) -> float:
@@ -136,18 +136,18 @@ class Run:
         return time.process_time() - self._cpu_begin
 
     def batches(self) -> Generator[Batch, None, None]:
-        """The batches from this step on, without end."""
+        """Endless batches from this step on."""
         start = self.progress.step * self.shapes_per_step
         return training_batches(self.shapes, start=start, workers=self.config.data.workers, **self._loading)
 
     def open_log(self, *, quiet: bool) -> RunLog:
-        """Begin to write the log."""
+        """Open the log for writing."""
         step, is_writer = self.progress.step, self.rank == 0
         self.log = RunLog(self.folder, self.config.run, step=step, is_writer=is_writer, quiet=quiet)
         return self.log
 
     def log_start(self) -> None:
-        """The log's first line, of the run or since it was resumed."""
+        """Log the start or the resumption of the run."""
         step, device, parameters = self.progress.step, self.accelerator.device, self.model.parameters()
         weights = sum(parameter.numel() for parameter in parameters)
         self.log.event(
@@ -164,7 +164,7 @@ class Run:
             f"{self.model.name}, {weights:,} parameters, on {device}"
             f"{f', {self.processes} processes' if self.processes > 1 else ''}: {len(self.shapes)} shapes, "
             f"{self.shapes_per_step} a step; evaluated on {self.evaluated_shapes}"
-            f"{'' if self.checkpoint is None else f'; goes on at step {step} of {self.checkpoint.path}'}"
+            f"{'' if self.checkpoint is None else f'; resumes at step {step} from {self.checkpoint.path}'}"
         )
 
     def write_config(self) -> None:
@@ -199,7 +199,7 @@ class Run:
             except CheckpointError as error:
                 reason = str(error)
                 self.log.event("checkpoint_failed", step=progress.step, reason=reason)
-        # The other processes wait here until it is written, and learn whether it is.
+        # The other processes wait here, and learn whether it was written.
         reason = gather(reason)[0]
         if reason is None:
             self.saved, self.is_saved = folder / step_folder(progress.step), True
@@ -209,7 +209,7 @@ class Run:
             warnings.warn(f"{reason}; the run goes on without this checkpoint", stacklevel=3)
 
     def measure(self, shapes: int, images: int = 0) -> Evaluation | None:
-        """Evaluate the model on `shapes` of those held back, and draw some of them; None where a stop was asked for."""
+        """Evaluate the model on this many held-out shapes, keeping some for images; None where a stop was requested."""
         settings, workers = self.config.run, min(1, self.config.data.workers)
         some = validation_batches(self.held_back, count=shapes, workers=workers, **self._loading)
         with contextlib.closing(some):
@@ -218,7 +218,7 @@ class Run:
             )
 
     def evaluate(self) -> bool:
-        """Evaluate, log it, note the best; False where a stop was asked for."""
+        """Evaluate, log, and note the best; False where a stop was requested."""
         progress, begun = self.progress, self.seconds()
         found = self.measure(self.config.run.evaluate_shapes, self.config.run.pictures if self.rank == 0 else 0)
         if found is None:
@@ -233,13 +233,13 @@ class Run:
         return True
 
     def plan(self) -> bool:
-        """Set the number of steps that fill the CPU minutes, from measured times; False where a stop was asked for."""
+        """Set the number of steps that fill the CPU minutes, from measured times; False where a stop was requested."""
         settings, progress = self.config.run, self.progress
         assert settings.cpu_minutes is not None
         by_views: dict[float, list[float]] = {}
         for views, seconds in progress.timed[SLOW_STEPS:] or progress.timed:
             by_views.setdefault(views, []).append(seconds)
-        # Numbers of views are drawn evenly, but so few draws are not even.
+        # Numbers of views are drawn uniformly, but so few draws are uneven.
         step_seconds = mean(mean(seconds) for seconds in by_views.values())
         for _ in range(2):  # the first batch is slower than the others
             begun = self.cpu_seconds()

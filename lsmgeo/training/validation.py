@@ -75,13 +75,13 @@ def evaluate_model(
     Args:
         model: its mode is restored in the end.
         batches: every shape with V views.
-        stop: when it is asked for, in any process, nothing is measured.
+        stop: where any process has one, nothing is measured.
         region: of the loss of depth.
         loss: of voxels.
-        images: how many shapes to keep with their predictions.
+        images: number of shapes kept with their predictions.
 
     Returns:
-        The same in all processes except for the examples; None where a stop was asked for.
+        The same in all processes except for the examples; None where a stop was requested.
     """
     measures: dict[int, Any] = {}
     total = count = 0.0

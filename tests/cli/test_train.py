@@ -30,7 +30,7 @@ def test_a_model_is_trained_and_goes_on(configuration, tmp_path, capsys):
     command = ["train", str(configuration), "--out", str(out), "--set", "run.steps=1"]
     assert cli.main([*command, "--set", "run.log_every=1"]) == 0
     printed = capsys.readouterr()
-    assert "ended:       at step 1, since all its steps are taken\n" in printed.out
+    assert "ended:       at step 1, since all steps are taken\n" in printed.out
     checkpoint = out / "checkpoints" / "step_00000001"
     assert f"checkpoint:  {checkpoint.resolve()}\n" in printed.out
     assert f"evaluate:    lsmgeo evaluate {checkpoint}\n" in printed.out
@@ -54,7 +54,7 @@ def test_a_signal_is_told_by_the_exit_status(configuration, tmp_path, capsys, mo
 
     monkeypatch.setattr(loop, "find_gradients", find_gradients)
     assert cli.main(["train", str(configuration), "--out", str(tmp_path)]) == status
-    assert "go on:       the same command" in capsys.readouterr().out
+    assert "resume:      the same command" in capsys.readouterr().out
     assert load_latest(tmp_path).step == 1
 
 

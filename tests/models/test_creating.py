@@ -100,7 +100,7 @@ def test_every_model_has_the_four_presets():
         ),
         (lambda: create("voxel-lsm", preset="tiny", planes=4), "there is no setting 'planes'"),
         (lambda: create("voxel-lsm", preset="tiny", image_size=30), "image_size must be a multiple of 4"),
-        (lambda: create("voxel-lsm", preset="tiny", image_size=4), "and twice that at least; got 4"),
+        (lambda: create("voxel-lsm", preset="tiny", image_size=4), "and at least twice that; got 4"),
         (lambda: create("voxel-lsm", preset="tiny", grid_size=4), "grid_size must be a multiple of 4"),
         (lambda: create("voxel-lsm", preset="tiny", feature_stride=3), "feature_stride must be one of 2, 4"),
         (

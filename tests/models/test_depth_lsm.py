@@ -162,7 +162,7 @@ def test_views_that_are_no_input_can_be_predicted(free):
     assert bool((free.run(images, cameras, mask, target_cameras=others).depth != 0).all())
 
 
-def test_a_model_with_skips_predicts_its_inputs_alone(tiny):
+def test_a_model_with_skips_predicts_only_its_inputs(tiny):
     images, cameras = look(1, 2)
     with pytest.raises(OptionError, match="create it with skips=False"):
         tiny(images, cameras, target_cameras=cameras)

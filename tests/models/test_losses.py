@@ -45,7 +45,7 @@ def test_steps_that_are_padding_do_not_count():
     total, count = sum_loss(VoxelOutput(logits[:, [2]]), given, steps=[2])
     torch.testing.assert_close(total, terms[0, 2])
     assert float(count) == 1
-    # After the last view every scene has something to tell, wherever its own last view stands.
+    # After the last view every scene has a prediction, wherever its own last view is.
     total, count = sum_loss(VoxelOutput(logits[:, [2]]), given, steps="last")
     torch.testing.assert_close(total, terms[:, 2].sum())
     assert float(count) == 2

@@ -13,13 +13,13 @@ from lsmgeo.metrics import voxel_iou
 from lsmgeo.models import Model, compute_loss, create
 
 
-def learn(model: Model, batch: Batch, steps: int, rate: float, told: str | None = None) -> Iterator[int]:
+def learn(model: Model, batch: Batch, steps: int, rate: float, after: str | None = None) -> Iterator[int]:
     optimiser = torch.optim.Adam(model.parameters(), rate)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, steps, pct_start=0.1)
     for step in range(steps):
         optimiser.zero_grad()
-        found = model(batch.images, batch.cameras, batch.view_mask, steps=told)
-        compute_loss(found, batch, steps=told).backward()
+        found = model(batch.images, batch.cameras, batch.view_mask, steps=after)
+        compute_loss(found, batch, steps=after).backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimiser.step()
         schedule.step()

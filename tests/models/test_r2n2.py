@@ -53,7 +53,7 @@ def correlated(x, weight, bias):
 
 
 def pooled(x):
-    """Maxima over 2 x 2 pixels of a picture with a border of one pixel that never wins."""
+    """Maxima over 2 x 2 pixels of an image with a border of one pixel that never wins."""
     channels, height, width = x.shape
     padded = np.pad(x, [(0, 0), (1, 1), (1, 1)], constant_values=-np.inf)
     h, w = height // 2 + 1, width // 2 + 1
@@ -178,7 +178,7 @@ def test_presets_have_their_sizes(preset, sizes):
         assert model.settings.pose == (name == "r2n2-pose")
 
 
-def test_rotations_are_read_with_pose_alone():
+def test_rotations_are_read_only_with_pose():
     images, cameras = scenes()
     # Farther away, at another focal length: a rotation is all that is read.
     moved = cameras.cam_from_world.clone()

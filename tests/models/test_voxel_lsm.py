@@ -110,7 +110,7 @@ def test_any_number_of_views_runs(tiny, fusion):
         found = model(images, cameras).logits
         for views in range(1, 20) if fusion == "gru" else (1, 2, 7):
             fewer = model(images[:, :views], some(cameras, 0, slice(views))).logits
-            # What is told after a view knows nothing of later ones.
+            # The prediction after a view does not depend on later views.
             torch.testing.assert_close(fewer, found[:, :views], rtol=0, atol=BATCHED)
     assert tuple(found.shape) == (1, 20, 16, 16, 16)
     assert bool(found.isfinite().all())
@@ -254,7 +254,7 @@ def test_arguments_are_checked(tiny):
     with pytest.raises(OptionError, match=r"pixel_rules must be Literal\['exact', 'release'\]"):
         create("voxel-lsm", preset="tiny", pixel_rules="half")
     images, cameras = look(1, 2)
-    with pytest.raises(ShapeError, match=r"voxel-lsm: images must be .* multiples of 4, 8 at least; got"):
+    with pytest.raises(ShapeError, match=r"voxel-lsm: images must be .* multiples of 4, at least 8; got"):
         tiny(images[..., :30], cameras)
     with pytest.raises(ShapeError, match="got \\(1, 2, 1, 32, 32\\)"):
         tiny(images[:, :, :1], cameras)

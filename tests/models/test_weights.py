@@ -102,7 +102,7 @@ def test_a_checkpoint_and_a_run_folder_are_read_too(tmp_path, model):
         load(tmp_path)
 
 
-def test_what_is_not_there_is_told(tmp_path):
+def test_what_is_not_there_is_reported(tmp_path):
     with pytest.raises(CheckpointError, match="no such file"):
         load(tmp_path / "none.safetensors")
     with pytest.raises(CheckpointError, match=r"holds neither model\.safetensors nor a checkpoint"):
@@ -112,7 +112,7 @@ def test_what_is_not_there_is_told(tmp_path):
         load(tmp_path / "pipe")
 
 
-def test_what_cannot_be_written_is_told(tmp_path, model):
+def test_what_cannot_be_written_is_reported(tmp_path, model):
     (tmp_path / "file").write_text("")
     with pytest.raises(CheckpointError, match="cannot be written"):
         write_weights(tmp_path / "file" / "model.safetensors", model)

@@ -1,4 +1,4 @@
-"""Runs that tests share: made once a module, copied where one goes on with them."""
+"""Runs that tests share: made once per module, copied where a test resumes them."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def run(original, tmp_path) -> Path:
 
 
 def losses_from(path: Path) -> tuple[int, list[float]]:
-    """Where a run goes on, and the losses of its steps up to 4."""
+    """Where a run resumes, and the losses of its steps up to 4."""
     training = Training()
     training.resume(path)
     begin = training.step
@@ -131,7 +131,7 @@ def test_the_last_ones_and_the_best_are_kept(tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["LATEST", "step_00000006", "step_00000007"]
 
 
-def test_meta_tells_what_is_there(run):
+def test_meta_describes_the_files(run):
     folder = run / "checkpoints" / "step_00000002"
     meta = json.loads((folder / "meta.json").read_text())
     for name in FILES[:2]:
@@ -150,7 +150,7 @@ def test_nothing_saved_is_no_error_and_everything_lost_is_one(run, tmp_path):
         load_latest(run)
 
 
-def test_a_missing_newest_one_is_told(run):
+def test_a_missing_newest_one_is_reported(run):
     shutil.rmtree(run / "checkpoints" / "step_00000002")
     with pytest.warns(UserWarning, match=r"step_00000002: is missing.* Going back to .*step_00000001"):
         assert load_latest(run).step == 1
@@ -233,7 +233,7 @@ def test_what_a_killed_run_of_an_earlier_version_left_is_cleared(run, third):
     assert sorted(os.listdir(run / "checkpoints")) == ["LATEST", *(f"step_0000000{step}" for step in (1, 2, 3))]
 
 
-def test_a_disk_that_is_full_at_any_moment_of_a_save_is_told_and_harms_nothing(run, third, tmp_path):
+def test_a_disk_that_is_full_at_any_moment_of_a_save_is_reported_and_harms_nothing(run, third, tmp_path):
     calls = count_points(third, run, tmp_path)
     told = []
     for at, name in enumerate(calls):
@@ -260,7 +260,7 @@ def test_a_disk_that_is_full_at_any_moment_of_a_save_is_told_and_harms_nothing(r
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
-def test_a_limit_on_the_size_of_files_is_told_and_harms_nothing(run, third, share):
+def test_a_limit_on_the_size_of_files_is_reported_and_harms_nothing(run, third, share):
     largest = max((run / "checkpoints" / "step_00000002" / name).stat().st_size for name in FILES)
 
     def work() -> None:
@@ -279,7 +279,7 @@ def test_a_limit_on_the_size_of_files_is_told_and_harms_nothing(run, third, shar
 # Read-only and vanished folders (F8)
 
 
-def test_a_read_only_folder_is_told(run, third, monkeypatch):
+def test_a_read_only_folder_is_reported(run, third, monkeypatch):
     def refuse(*arguments, **options):
         raise OSError(30, os.strerror(30))
 
@@ -289,7 +289,7 @@ def test_a_read_only_folder_is_told(run, third, monkeypatch):
     assert load_latest(run).step == 2
 
 
-def test_a_file_in_the_way_is_told(tmp_path):
+def test_a_file_in_the_way_is_reported(tmp_path):
     (tmp_path / "checkpoints").write_text("")
     with pytest.raises(CheckpointError, match="cannot be written"):
         Training().save(tmp_path / "checkpoints")

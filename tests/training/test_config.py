@@ -1,4 +1,4 @@
-"""Configurations: what is read, and how a wrong one is told."""
+"""Configurations: what is read, and how invalid ones are reported."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_what_is_written_beside_a_run_is_the_same_configuration(path, tmp_path):
         ("run=3", "an override must be group.key=value"),
     ],
 )
-def test_a_wrong_override_is_told(path, override, message):
+def test_a_wrong_override_is_reported(path, override, message):
     if message is None:
         assert read_config(path, [override]).data.source == "synthetic-13"
         return

@@ -52,7 +52,7 @@ def at_call(monkeypatch, owner, name: str, number: int, before: Callable[[], obj
 
 
 def during_save(monkeypatch, number: int, points: Points) -> None:
-    """Count the points of a process's n-th save, from 1, alone."""
+    """Count only the points of a process's n-th save, from 1."""
     save, calls = run_state.save_checkpoint, []
 
     def replacement(*arguments, **options):
@@ -232,7 +232,7 @@ def test_a_second_signal_ends_a_save_at_once(config, whole, begun, monkeypatch):
     assert leftovers(begun / "checkpoints") == []
 
 
-def test_the_signal_is_caught_in_training_alone(config, tmp_path):
+def test_the_signal_is_caught_only_in_training(config, tmp_path):
     before = signal.getsignal(signal.SIGTERM)
     run(configure(Path(config.data.source), steps=1), tmp_path)
     assert signal.getsignal(signal.SIGTERM) is before
@@ -318,7 +318,7 @@ def test_a_loss_that_is_not_finite_in_one_process_is_skipped_by_both(config, sha
 # F8: folders that vanish or cannot be written
 
 
-def test_a_log_that_cannot_be_written_is_told_once_and_costs_nothing(config, whole, begun, monkeypatch):
+def test_a_log_that_cannot_be_written_is_reported_once_and_costs_nothing(config, whole, begun, monkeypatch):
     opened = os.open
 
     def full(path, *arguments, **options):
@@ -367,7 +367,7 @@ def test_a_run_folder_that_vanishes_is_made_again(config, whole, begun, monkeypa
     assert_same_end(begun, whole)
 
 
-def test_a_folder_that_cannot_be_written_is_told_before_the_work(config, tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_written_is_reported_before_the_work(config, tmp_path, monkeypatch):
     (tmp_path / "checkpoints").write_text("")
     at_call(monkeypatch, loop, "find_gradients", 1, lambda: pytest.fail("worked in vain"))
     with pytest.raises(CheckpointError, match="cannot be written"):

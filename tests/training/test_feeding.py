@@ -228,14 +228,14 @@ def test_another_size_of_images_keeps_the_geometry(size):
         ({"views": 9}, VOXELS, "views; 9 are asked for"),
     ],
 )
-def test_what_a_set_lacks_is_told_at_once(shards, changes, need, message):
+def test_what_a_set_lacks_is_reported_at_once(shards, changes, need, message):
     config = DataConfig(**{"source": str(shards), "views": 1, **changes})
     with pytest.raises((OptionError, DataError)) as caught:
         opened(config, need)
     assert message.format(shards=shards) in str(caught.value)
 
 
-def test_shards_without_depth_are_told(tmp_path):
+def test_shards_without_depth_are_reported(tmp_path):
     render_set("synthetic-13", tmp_path, Recipe(0, 1, 16, (16,), depth=False), shapes=13, jobs=1)
     with pytest.raises(OptionError, match="data: source has no depth, which the model needs"):
         opened(DataConfig(source=str(tmp_path), views=1), DEPTH)

@@ -1,4 +1,4 @@
-"""What a run knows of itself when it goes on: its best, its beginning, the shapes it skipped."""
+"""What a resumed run knows of itself: its best, its beginning, the shapes it skipped."""
 
 import json
 import math
@@ -50,7 +50,7 @@ def test_a_run_goes_on_without_the_weights_it_began_with(shards, tmp_path):
     assert run(changed(config, "run", steps=2), tmp_path / "run").step == 2
 
 
-def test_a_skipped_shape_is_told_in_the_run(shards, tmp_path):
+def test_a_skipped_shape_is_reported_in_the_run(shards, tmp_path):
     copy = shutil.copytree(shards, tmp_path / "shards")
     shard = next(copy.glob("*.tar"))
     first = next(index for index, part in enumerate(ShardSet(copy).splits) if part == "train")
@@ -70,9 +70,9 @@ def test_one_view_is_not_drawn_for_shapes_that_have_differently_many(shards):
         configure(shards, loss_views="random")
 
 
-def test_pictures_grow_in_evaluation_as_in_training(shards):
+def test_images_grow_in_evaluation_as_in_training(shards):
     sample = ShardSet(shards).read(0, depth=False, occupancy=None)
     images, _ = resize_views(sample.images[None], type(sample.cameras)(*(item[None] for item in sample.cameras)), 48)
     torch.testing.assert_close(images[0], resize_sample(sample, 48).images, rtol=0, atol=0)
-    # Interpolated, not repeated: every second pixel of a row of a repeated picture equals its neighbour.
+    # Interpolated, not repeated: every second pixel of a row of a repeated image equals its neighbour.
     assert not torch.equal(images[0, ..., 0], images[0, ..., 1])

@@ -55,7 +55,7 @@ def test_accumulated_batches_are_one_batch(shards, plain, tmp_path):
 
 
 def test_a_step_follows_the_gradient_of_the_mean_loss(shards, plain):
-    """The first logged loss and norm, from the model, the batch and torch alone."""
+    """The first logged loss and norm, from only the model, the batch and torch."""
     config = configure(shards, steps=3, batch=4)
     (batch,) = first_batches(config, 1)
     assert not batch.view_mask.all()  # scenes of one view and of two: steps weigh, not scenes
@@ -115,9 +115,9 @@ def test_the_loss_of_some_views(shards, tmp_path, loss_views):
         drawn.append(-1 if loss_views == "last" else optim.loss_views_of(config.run, step, 2)[0])
         with torch.no_grad():
             output = model(batch.images, batch.cameras, batch.view_mask)
-        # A scene of one view tells at the end what it told after the first.
-        told = output.logits[:, drawn[-1]]
-        expected.append(float(binary_cross_entropy_with_logits(told, batch.occupancy.float())))
+        # A scene of one view ends with its prediction after the first.
+        predicted = output.logits[:, drawn[-1]]
+        expected.append(float(binary_cross_entropy_with_logits(predicted, batch.occupancy.float())))
         of_every.append(float(compute_loss(output, batch)))
     assert set(drawn) == ({-1} if loss_views == "last" else {0, 1})
     assert list(losses(tmp_path).values()) == pytest.approx(expected, rel=1e-6)
@@ -291,13 +291,13 @@ def test_two_runs_do_not_share_a_folder(shards, tmp_path):
         ({"evaluate_views": 9}, "views; 9 are asked for"),
     ],
 )
-def test_what_cannot_be_is_told_before_the_work(shards, tmp_path, changes, message):
+def test_what_is_impossible_is_reported_before_the_work(shards, tmp_path, changes, message):
     with pytest.raises((OptionError, OSError), match=message):
         run(configure(shards, **changes), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
-def test_a_folder_that_cannot_be_written_is_told_before_the_work(shards, tmp_path):
+def test_a_folder_that_cannot_be_written_is_reported_before_the_work(shards, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="cannot be written"):
         run(configure(shards), tmp_path / "file")
@@ -331,7 +331,7 @@ def test_a_cosine_may_wait_until_its_end_is_known():
 
 
 def test_what_is_left_to_the_trainer_is_decided_once(shards, tmp_path, monkeypatch):
-    """bf16 where the CPU has AMX; a run that goes on without keeps it."""
+    """bf16 where the CPU has AMX; a resumed run keeps it without AMX."""
     left = configure(shards, precision="auto")
     for has_amx, expected in ((False, "no"), (True, "bf16")):
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda has_amx=has_amx: {"amx_bf16": has_amx})

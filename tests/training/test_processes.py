@@ -48,13 +48,13 @@ def test_two_processes_evaluate_the_same_set(plain, together):
     assert ours["loss"] == pytest.approx(theirs["loss"], rel=1e-3)
 
 
-def test_the_first_process_alone_writes(together):
+def test_only_the_first_process_writes(together):
     lines = events(together)
     assert [line["event"] for line in lines].count("start") == 1
     assert len(events(together, "step")) == 3
 
 
-def test_processes_that_begin_differently_are_told(shards, tmp_path):
+def test_processes_that_begin_differently_are_reported(shards, tmp_path):
     """One of them was given another seed: neither trains."""
 
     def begin(rank):

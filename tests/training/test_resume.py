@@ -78,7 +78,7 @@ def test_the_comparison_can_fail(shards, whole, tmp_path):
 
 
 def test_nothing_is_drawn_from_generators_of_all(shards, whole, begun, monkeypatch):
-    """No state of them is saved: they are set to something else before every step, in a run that stops and goes on.
+    """No state of them is saved: they are set to something else before every step, in a run that stops and resumes.
 
     Its first checkpoint is of an earlier version, which did save it.
     """
@@ -221,7 +221,7 @@ def test_cpu_minutes_become_a_number_of_steps(timed, timed_config):
 
 
 def test_steps_that_were_planned_are_never_planned_again(timed, timed_config, tmp_path, monkeypatch):
-    """A run killed after the plan goes on bit by bit on a slower machine; so does one that is told its steps."""
+    """A run killed after the plan resumes bit by bit on a slower machine; so does one with a given number of steps."""
     with cpu_clock(), monkeypatch.context() as patch:
         stop_in(patch, 31)
         assert run(timed_config, tmp_path / "killed").step == 31

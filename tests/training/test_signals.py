@@ -121,7 +121,7 @@ def test_the_end_of_the_data_passes():
     with catch_stop() as stop:
         with pytest.raises(StopIteration):
             stop.next_item(iter([]))
-        ask()  # after the wait: sets the flag alone
+        ask()  # after the wait: only sets the flag
         assert stop
 
 
@@ -189,7 +189,7 @@ def test_processes_agree():
     assert in_processes(work) == [0, 0]
 
 
-def test_alone_every_answer_is_ones_own():
+def test_a_single_process_gathers_its_own_value():
     assert any_true(True)
     assert not any_true(False)
     assert gather(3) == [3]

@@ -274,7 +274,7 @@ def parse_weights(content: bytes, path: Path) -> Weights:
         tensors = safetensors.torch.load(content)
         settings, about = json.loads(metadata["settings"]), json.loads(metadata["about"])
         if metadata.pop("sha256") != checksum(metadata, tensors):
-            raise CheckpointError(path, "is damaged: its SHA-256 is not the one that was saved")
+            raise CheckpointError(path, "is damaged: its SHA-256 does not match the saved one")
     except (safetensors.SafetensorError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CheckpointError(path, f"is damaged, or not a file of weights ({str(error)[:200]})") from error
     if not isinstance(settings, dict) or not isinstance(about, dict):

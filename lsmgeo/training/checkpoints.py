@@ -232,7 +232,7 @@ def _read(folder: Path) -> Checkpoint:
         if len(content) != size:
             raise CheckpointError(folder / name, f"has {len(content)} bytes instead of {size}")
         if hashlib.sha256(content).hexdigest() != digest:
-            raise CheckpointError(folder / name, "is damaged: its SHA-256 is not the one that was saved")
+            raise CheckpointError(folder / name, "is damaged: its SHA-256 does not match the saved one")
     weights = parse_weights(contents[WEIGHTS], folder / WEIGHTS)
     try:
         state = torch.load(io.BytesIO(contents[STATE]), map_location="cpu", weights_only=True)
@@ -261,7 +261,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
         reason = f"is of format {version}, made by a newer lsmgeo; this one reads up to {FORMAT}"
         raise NewerFormatError(path, reason)
     if not is_whole:
-        raise CheckpointError(path, "is damaged: its SHA-256 is not the one that was saved")
+        raise CheckpointError(path, "is damaged: its SHA-256 does not match the saved one")
     return meta
 
 

@@ -69,7 +69,7 @@ class RunLog:
         try:
             _append_line(self.folder / LOG, line.encode())
         except OSError as error:
-            self._warn(LOG, f"{self.folder / LOG}: cannot be written ({error}); the run goes on")
+            self._warn(LOG, f"{self.folder / LOG}: cannot be written ({error}); the run continues")
 
     def step(self, step: int, *, waited: float, **values: float) -> None:
         """Log a step and its curves: seconds `waited` for data, loss, learning rate, ..."""
@@ -105,7 +105,7 @@ class RunLog:
         try:
             write_atomic(self.folder / "pictures" / f"predicted_{step:08d}.png", encode_png(image))
         except DataError as error:
-            self._warn("pictures", f"{error}; the run goes on")
+            self._warn("pictures", f"{error}; the run continues")
         if self._board is not None:
             with self._warn_of_errors():
                 self._board.add_image("predicted", image, step, dataformats="HWC")
@@ -134,7 +134,7 @@ class RunLog:
         except ImportError:
             warnings.warn("tensorboard is not installed: only log.jsonl and pictures are written", stacklevel=3)
         except OSError as error:
-            self._warn("tensorboard", f"TensorBoard's files cannot be written ({error}); the run goes on")
+            self._warn("tensorboard", f"TensorBoard's files cannot be written ({error}); the run continues")
         return None
 
     @contextlib.contextmanager
@@ -144,7 +144,7 @@ class RunLog:
         # Its writer is a thread, whose errors are raised by a later call.
         except (OSError, RuntimeError) as error:
             self._board = None
-            self._warn("tensorboard", f"TensorBoard's files cannot be written ({error}); the run goes on without")
+            self._warn("tensorboard", f"TensorBoard's files cannot be written ({error}); the run continues without")
 
     def _warn(self, what: str, message: str) -> None:
         if what not in self._warned:

@@ -146,7 +146,7 @@ def find_gradients(
     """The loss of some batches in every process, and its gradient in the parameters' ``grad``.
 
     Numbers of views differ between shapes, and with them the numbers of terms of processes and batches. So sums are
-    differentiated and in the end divided by the number of all terms: shapes weigh the same in every batch and process.
+    differentiated, and finally divided by the number of all terms: shapes weigh the same in every batch and process.
 
     Args:
         wrapped: the model, as the accelerator prepared it; its gradients are None.

@@ -206,7 +206,7 @@ class Run:
         elif must:
             raise CheckpointError(folder, reason)
         else:
-            warnings.warn(f"{reason}; the run goes on without this checkpoint", stacklevel=3)
+            warnings.warn(f"{reason}; the run continues without this checkpoint", stacklevel=3)
 
     def measure(self, shapes: int, images: int = 0) -> Evaluation | None:
         """Evaluate the model on this many held-out shapes, keeping some for images; None where a stop was requested."""

@@ -73,7 +73,7 @@ def evaluate_model(
     """Measure a model on batches, which together with those of the other processes are the whole set.
 
     Args:
-        model: its mode is restored in the end.
+        model: its mode is restored afterwards.
         batches: every shape with V views.
         stop: where any process has one, nothing is measured.
         region: of the loss of depth.

@@ -117,7 +117,7 @@ def test_a_disk_that_is_full_for_a_while_costs_no_step(config, whole, begun, mon
     def work() -> None:
         at_call(monkeypatch, loop, "find_gradients", 1, lambda: limit(points[0]))
         at_call(monkeypatch, loop, "find_gradients", 3, lambda: limit(points[1]))
-        with pytest.warns(UserWarning, match=r"step_00000004: cannot be written .*File too large.* the run goes on"):
+        with pytest.warns(UserWarning, match=r"step_00000004: cannot be written .*File too large.* the run continues"):
             run(config, begun)
 
     assert in_child(work) == 0
@@ -145,7 +145,7 @@ def test_a_disk_that_stays_full_ends_the_run_with_an_error_and_the_last_checkpoi
 @pytest.mark.parametrize("at", [0, 6, 14])
 def test_a_save_without_room_is_tried_again(config, whole, begun, monkeypatch, at):
     during_save(monkeypatch, 1, Points(fill, at))
-    with pytest.warns(UserWarning, match=r"No space left on device.* the run goes on"):
+    with pytest.warns(UserWarning, match=r"No space left on device.* the run continues"):
         run(config, begun)
     assert_same_run(begun, whole)
 
@@ -155,7 +155,7 @@ def test_a_stop_right_after_a_failed_save_saves(config, whole, begun, monkeypatc
     with monkeypatch.context() as patch:
         at_call(patch, run_state, "save_checkpoint", 1, ask)
         during_save(patch, 1, Points(fill, 0))
-        with pytest.warns(UserWarning, match="the run goes on"):
+        with pytest.warns(UserWarning, match="the run continues"):
             stopped = run(config, begun)
     assert (stopped.step, stopped.ended) == (4, "stop")
     assert end_of(begun)[0] == 4

@@ -116,8 +116,8 @@ def open_shapes(
     if isinstance(found, SyntheticSet):
         on_device = device.type != "cpu"
         render = partial(render_batch, depth=need.depth, device=device, at_once=on_device)
-        names = [f"{found.seed}/{found.pool}/{number}" for number in found.numbers]
-        return Shapes(adapted, render, _identity(names), on_device)
+        identifiers = [f"{found.seed}/{found.pool}/{number}" for number in found.numbers]
+        return Shapes(adapted, render, _identity(identifiers), on_device)
     return Shapes(adapted, collate, _identity(dataset.names[:length]))
 
 

@@ -65,8 +65,8 @@ class StepGuard:
     precision must still be updated, or it never lowers its scale.
 
     Args:
-        in_a_row: this many skipped steps in a row end the training; ...
-        share: ... so do more than 5 skipped steps that are more than this share of all.
+        in_a_row: this many skipped steps in a row end the training.
+        share: more than 5 skipped steps that are also more than this share of all steps end it too.
 
     Example:
         >>> guard = StepGuard(in_a_row=2)

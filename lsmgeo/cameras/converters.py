@@ -356,7 +356,6 @@ def from_pytorch3d(
         principal_point=principal_point.shape[:-1],
     )
     focal_length, principal_point = torch.broadcast_tensors(focal_length, principal_point)
-    focal_length = check_last_axes(who, "focal_length", focal_length, 2)
     if in_ndc:
         scale = 0.5 * min(height, width)
         focal_length = scale * focal_length

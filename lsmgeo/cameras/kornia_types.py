@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
+from torch.nn.functional import pad
+
+from lsmgeo._linalg import homogeneous_row
 
 __all__ = ["PinholeCamera", "from_fields", "to_fields"]
 
@@ -19,8 +21,6 @@ def to_fields(camera: PinholeCamera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 def from_fields(intrinsics: Tensor, cam_from_world: Tensor, height: Tensor, width: Tensor) -> PinholeCamera:
     """One ``PinholeCamera`` of K (..., 3, 3), extrinsics (..., 4, 4) and sizes (...), leading axes flattened."""
-    corner = intrinsics.new_tensor([0.0, 0.0, 0.0, 1.0])
-    intrinsics = torch.cat((intrinsics, torch.zeros_like(intrinsics[..., :1])), -1)
-    intrinsics = torch.cat((intrinsics, corner.expand(*intrinsics.shape[:-2], 1, 4)), -2)
+    intrinsics = homogeneous_row(pad(intrinsics, (0, 1)))  # (..., 4, 4)
     matrices = (intrinsics.reshape(-1, 4, 4), cam_from_world.reshape(-1, 4, 4))
     return PinholeCamera(*matrices, height.reshape(-1), width.reshape(-1))

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lsmgeo._checks import (
     GEOMETRY,
@@ -95,7 +96,7 @@ def crop(cameras: Cameras, top: int | Tensor, left: int | Tensor, height: int, w
     x, y = (_number("crop", name, side, K, leading).to(K.dtype) for name, side in (("left", left), ("top", top)))
     check_devices("crop", cameras=K, left=x, top=y)
     offset = torch.stack((x.expand(leading), y.expand(leading)), -1)[..., None]
-    return _of_size(tensors, K - torch.nn.functional.pad(offset, (2, 0, 0, 1)), height, width)
+    return _of_size(tensors, K - pad(offset, (2, 0, 0, 1)), height, width)
 
 
 def _of_size(cameras: CameraTensors, intrinsics: Tensor, height: int, width: int) -> CameraTensors:

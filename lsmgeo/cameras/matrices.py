@@ -31,6 +31,19 @@ class CameraMatrices(NamedTuple):
         x, y, z = points[..., None].unbind(-2)  # (..., N, 1)
         return P[..., 0] * x + P[..., 1] * y + P[..., 2] * z + P[..., 3]
 
+    def windows(self, corners: Tensor, size: tuple[int, int], near: float = 1e-6) -> Tensor:
+        """First and last + 1 row and column (..., 4) of the pixels that can show boxes with corners (..., N, 3).
+
+        With a margin of one pixel for rounding; all pixels for a box that is not in front of the near plane.
+        """
+        x, y, depth = self.homogeneous_pixels(corners).unbind(-1)
+        in_front, sides = (depth > near).all(-1), []
+        for pixel, count in ((y, size[0]), (x, size[1])):
+            pixel = pixel / depth.clamp_min(near)
+            first, last = (pixel.amin(-1).floor() - 1).clamp(0, count), (pixel.amax(-1).ceil() + 2).clamp(0, count)
+            sides += [torch.where(in_front, first, 0), torch.where(in_front, last, count)]
+        return torch.stack(sides, -1).long()
+
     def world_from_pixel(self) -> Tensor:
         """R^T K^-1, (..., 3, 3): applied to (u, v, 1), the step along a pixel's ray that advances camera z by 1."""
         return multiply(self.rotation.transpose(-1, -2), inverse_3x3(self.intrinsics))

@@ -151,17 +151,9 @@ def _windows(
     """First and last + 1 row and column of the pixels that can show a primitive, from the corners of its box."""
     corners = torch.cartesian_prod(*[rows.new_tensor([-1.0, 1.0], dtype=torch.float64)] * 3)  # (8, 3)
     world = transform(tables.axes[rows, None], corners) + tables.center[rows, None]  # (P, 8, 3)
-    homogeneous = CameraMatrices(*(value[views] for value in cameras)).homogeneous_pixels(world)
-    depth = homogeneous[..., 2]
-    pixel = homogeneous[..., :2] / depth.clamp_min(near)[..., None]
-    limit = pixel.new_tensor([size[1], size[0]])
-    # One pixel of margin for rounding; behind the near plane the projection is unbounded.
-    first = (pixel.amin(1).floor() - 1).clamp_min(0).minimum(limit)
-    last = (pixel.amax(1).ceil() + 2).clamp_min(0).minimum(limit)
-    bounded = [kind is not Kind.HALF_SPACE for kind in tables.kinds]
-    whole = ~(rows.new_tensor(bounded, dtype=torch.bool)[rows] & (depth > near).all(1))[:, None]
-    first, last = torch.where(whole, 0.0, first).long(), torch.where(whole, limit, last).long()
-    return torch.stack((first[:, 1], last[:, 1], first[:, 0], last[:, 0]), 1).tolist()
+    windows = CameraMatrices(*(value[views] for value in cameras)).windows(world, size, near)
+    bounded = rows.new_tensor([kind is not Kind.HALF_SPACE for kind in tables.kinds], dtype=torch.bool)[rows, None]
+    return torch.where(bounded, windows, windows.new_tensor([0, size[0], 0, size[1]])).tolist()
 
 
 class FreeRays:

@@ -103,7 +103,7 @@ def render_mesh(
     centers = matrices.center.numpy(force=True)
     from_pixel = matrices.world_from_pixel().numpy(force=True)
     box = torch.cartesian_prod(*torch.from_numpy(mesh.bounds).to(tensors.device, torch.float64).unbind(1))
-    corners_seen = matrices.homogeneous_pixels(box).numpy(force=True)  # (V, 8, 3)
+    windows = matrices.windows(box, size).tolist()
 
     images = background_array(who, background, (len(centers), 3, *size), torch.device("cpu"), torch.float32)
     depth, mask = torch.zeros(len(centers), *size), torch.zeros(len(centers), *size, dtype=torch.bool)
@@ -111,8 +111,8 @@ def render_mesh(
     flat = face_normals(mesh.vertices, mesh.faces)
     corners = corner_normals(mesh.vertices, mesh.faces, float(crease)) if smooth else None
     surface = _Surface(mesh, flat, corners, backend)
-    for view in range(len(centers)):
-        pixels = _pixels_near(corners_seen[view], size)
+    for view, (top, bottom, left, right) in enumerate(windows):
+        pixels = (np.arange(top, bottom)[:, None] * size[1] + np.arange(left, right)).reshape(-1)
         for begin in range(0, len(pixels), RAYS_AT_ONCE):
             some = pixels[begin : begin + RAYS_AT_ONCE]
             # Camera z of these directions is 1, so a distance along them is a depth.
@@ -120,21 +120,6 @@ def render_mesh(
             directions = (from_pixel[view] @ rays).T
             surface.render(Rendering(*(field[view] for field in out)), some, centers[view], directions, lights, shadows)
     return out
-
-
-def _pixels_near(corners: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Which pixels may see the mesh, row by row: those in the window of its bounding box, if all of it is in front.
-
-    The box is given by the homogeneous pixels (8, 3) of its corners.
-    """
-    x, y, z = corners.T
-    low, high = np.zeros(2, np.int64), np.array(size)
-    if z.min() > 1e-6 * np.abs(z).max():
-        v, u = y / z, x / z
-        low = np.maximum(np.floor([v.min(), u.min()]).clip(-1, 2**31) - 1, low).astype(np.int64)
-        high = np.minimum(np.ceil([v.max(), u.max()]).clip(-1, 2**31) + 2, high).astype(np.int64)
-    rows, columns = np.arange(low[0], high[0]), np.arange(low[1], high[1])
-    return (rows[:, None] * size[1] + columns).reshape(-1)
 
 
 class _Surface:

@@ -1,4 +1,4 @@
-"""In which dtype to compute, and how to come back from it."""
+"""The dtype of the arithmetic, and the cast from it to the dtype of the output."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ def computing_dtype(values: Tensor) -> torch.dtype:
 
 
 def saturation_limit(dtype: torch.dtype) -> float:
-    """What an output saturates beyond: what rounds to the dtype's largest finite value does not, gradients pass it."""
+    """The limit beyond which outputs saturate; what rounds to the dtype's largest finite value passes gradients."""
     info = torch.finfo(dtype)
     return info.max * (1.0 + info.eps / 8.0)
 
 
 def saturating_cast(values: Tensor, dtype: torch.dtype) -> Tensor:
-    """Cast to a dtype of which the largest finite value stands for all above it: what is finite stays finite."""
+    """Cast to a dtype; larger values become its largest finite value, so that finite values stay finite."""
     if values.dtype == dtype:
         return values
     limit = saturation_limit(dtype)

@@ -29,7 +29,7 @@ def check_features(who: str, features: Tensor, count: int | None = None) -> tupl
     expected = "(B, V, C, h, w)"
     check_float(who, "features", features, expected)
     if features.dim() != 5 or (count is not None and features.shape[0] * features.shape[1] != count):
-        # The text is made here alone: under a trace, a number put into a text is a constant of the graph.
+        # Only here, for the error: under a trace, a number that is formatted becomes a constant of the graph.
         views = "" if count is None else f" with B*V = {count} cameras"
         product = "" if features.dim() != 5 else f", that is {features.shape[0] * features.shape[1]}"
         raise ShapeError(f"{who}: features must be {expected}{views}; got {tuple(features.shape)}{product}")

@@ -91,8 +91,8 @@ def _shifted(intrinsics: Tensor, pixels: float) -> Tensor:
 
 def _join(who: str, K: Tensor, R: Tensor, t: Tensor, height: Size, width: Size, pixel_center: str) -> CameraTensors:
     check_choice(who, "pixel_center", pixel_center, PIXEL_CENTERS)
-    if pixel_center == "half":
-        K = _shifted(K, -0.5)
+    check_last_axes(who, "intrinsics", K, 3, 3)
+    K = _shifted(K, -0.5) if pixel_center == "half" else K
     check_devices(who, intrinsics=K, rotation=R, translation=t)
     leading = check_broadcast(who, intrinsics=K.shape[:-2], rotation=R.shape[:-2], translation=t.shape[:-1])
     rows = torch.cat((R.expand(*leading, 3, 3), t[..., None].expand(*leading, 3, 1)), -1)
@@ -144,7 +144,6 @@ def from_opencv(
         tensor([-1., -1.,  1.,  1.])
     """
     who = "from_opencv"
-    K = check_last_axes(who, "intrinsics", intrinsics, 3, 3)
     check_geometry(who, "rotation", rotation, "(..., 3) or (..., 3, 3)")
     t = check_last_axes(who, "translation", translation, 3)
     looks_like_matrices = tuple(rotation.shape[-2:]) == (3, 3)
@@ -159,7 +158,7 @@ def from_opencv(
     else:
         vectors = check_last_axes(who, "rotation", rotation, 3)
         R = axis_angle_to_rotation_matrix(vectors.reshape(-1, 3)).reshape(*vectors.shape[:-1], 3, 3)
-    return _join(who, K, R, t, height, width, pixel_center)
+    return _join(who, intrinsics, R, t, height, width, pixel_center)
 
 
 def to_opencv(cameras: Cameras, *, pixel_center: str = "integer") -> OpenCVCameras:
@@ -209,11 +208,10 @@ def from_opengl(
         (tensor([0., 0., 2.]), tensor([31.5000, 23.5000]))
     """
     who = "from_opengl"
-    K = check_last_axes(who, "intrinsics", intrinsics, 3, 3)
     pose = check_last_axes(who, "world_from_cam", world_from_cam, 4, 4)
     flip = pose.new_tensor([1.0, -1.0, -1.0])
     R = flip[:, None] * pose[..., :3, :3].transpose(-1, -2) + 0.0
-    return _join(who, K, R, 0.0 - transform(R, pose[..., :3, 3]), height, width, pixel_center)
+    return _join(who, intrinsics, R, 0.0 - transform(R, pose[..., :3, 3]), height, width, pixel_center)
 
 
 def to_opengl(cameras: Cameras, *, pixel_center: str = "half") -> OpenGLCameras:
@@ -272,12 +270,11 @@ def from_colmap(
         tensor([31.5000, 23.5000])
     """
     who = "from_colmap"
-    K = check_last_axes(who, "intrinsics", intrinsics, 3, 3)
     q = check_last_axes(who, "quaternion", quaternion, 4)
     if can_inspect(q) and not bool((q.abs().amax(-1) > 0).all()):
         raise CameraError(f"{who}: quaternion must not be zero")
     R = quaternion_to_rotation_matrix(q.reshape(-1, 4)).reshape(*q.shape[:-1], 3, 3)
-    return _join(who, K, R, check_last_axes(who, "translation", translation, 3), height, width, pixel_center)
+    return _join(who, intrinsics, R, check_last_axes(who, "translation", translation, 3), height, width, pixel_center)
 
 
 def to_colmap(cameras: Cameras, *, pixel_center: str = "half") -> ColmapCameras:

@@ -224,8 +224,8 @@ def orbit(
     target = _vector(who, "target", target, like)
     check_devices(who, **numbers, target=target)
     check_broadcast(who, **{name: value.shape for name, value in numbers.items()}, target=target.shape[:-1])
-    turn, tilt, radius, focal = torch.broadcast_tensors(*numbers.values())
-    a, e = torch.deg2rad(turn), torch.deg2rad(tilt)
+    *angles, radius, focal = torch.broadcast_tensors(*numbers.values())
+    a, e = map(torch.deg2rad, angles)
     direction = torch.stack((e.cos() * a.cos(), e.sin(), e.cos() * a.sin()), -1)
     eye = target + radius[..., None] * direction
     up = eye.new_tensor([0.0, 1.0, 0.0])
@@ -284,11 +284,11 @@ def perturb(
     axis = torch.randn(*leading, 3, generator=generator, dtype=E.dtype, device=E.device)
     axis = axis / torch.linalg.vector_norm(axis, dim=-1, keepdim=True).clamp_min(torch.finfo(E.dtype).tiny)
     angle = torch.rand(*leading, 1, generator=generator, dtype=E.dtype, device=E.device) * 2.0 - 1.0
-    turn = axis_angle_to_rotation_matrix((axis * angle * torch.pi * degrees / 180.0).reshape(-1, 3))
-    turn = turn.reshape(*leading, 3, 3)
+    dR = axis_angle_to_rotation_matrix((axis * angle * torch.pi * degrees / 180.0).reshape(-1, 3))
+    dR = dR.reshape(*leading, 3, 3)
     R, t = E[..., :3, :3], E[..., :3, 3]
-    offset = target.expand(*leading, 3) - transform(turn, target.expand(*leading, 3))
-    rows = torch.cat((multiply(R, turn), (transform(R, offset) + t)[..., None]), -1)
+    offset = target.expand(*leading, 3) - transform(dR, target.expand(*leading, 3))
+    rows = torch.cat((multiply(R, dR), (transform(R, offset) + t)[..., None]), -1)
     noisy = tensors._replace(cam_from_world=homogeneous_row(rows))
     check_cameras(who, noisy)
     return noisy

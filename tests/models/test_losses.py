@@ -28,7 +28,7 @@ def test_cross_entropy_in_closed_form():
     solid[0, 0] = True
     logits = torch.stack((torch.full((2, 2, 2), 3.0), torch.full((2, 2, 2), -1.0)))[None]
     found = compute_loss(VoxelOutput(logits), batch(torch.ones(1, 2, dtype=torch.bool), occupancy=solid))
-    # Half of the voxels are solid: softplus(-x) there, softplus(x) elsewhere; the mean of two steps.
+    # Half of the voxels are occupied: softplus(-x) there, softplus(x) elsewhere; the mean of two steps.
     expected = (softplus(-3.0) + softplus(3.0) + softplus(1.0) + softplus(-1.0)) / 4
     torch.testing.assert_close(found, expected.float())
 
@@ -133,14 +133,14 @@ def test_arguments_are_checked():
 
 
 def test_overlap_in_closed_form():
-    """Two steps of half-solid scenes: p of sigmoid(3) everywhere, then of sigmoid(-1)."""
+    """Two steps of half-occupied scenes: p of sigmoid(3) everywhere, then of sigmoid(-1)."""
     solid = torch.zeros(1, 2, 2, 2, dtype=torch.bool)
     solid[0, 0] = True
     logits = torch.stack((torch.full((2, 2, 2), 3.0), torch.full((2, 2, 2), -1.0)))[None].requires_grad_()
     given = batch(torch.ones(1, 2, dtype=torch.bool), occupancy=solid)
     found = compute_loss(VoxelOutput(logits), given, loss="bce+iou")
     p = torch.tensor([3.0, -1.0], dtype=torch.float64).sigmoid()
-    # 8 voxels of which 4 are solid: 4 p / (8 p + 4 - 4 p)
+    # 8 voxels of which 4 are occupied: 4 p / (8 p + 4 - 4 p)
     apart = (1 - p / (1 + p)).mean()
     plain = compute_loss(VoxelOutput(logits), given)
     torch.testing.assert_close((found - plain).detach(), (0.1 * apart).float())

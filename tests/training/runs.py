@@ -96,7 +96,7 @@ def assert_same_end(folder: Path, expected: Path) -> None:
 
 
 def assert_same_run(folder: Path, expected: Path) -> None:
-    """And the log of one tells of every step of the other."""
+    """And the log of one has every step of the other."""
     assert_same_end(folder, expected)
     assert losses(folder).keys() == losses(expected).keys()
 

@@ -1,4 +1,4 @@
-"""The loop: what it learns from, when it ends, what it says and keeps."""
+"""The loop: its batches and losses, its end, its messages and files."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_step_follows_the_gradient_of_the_mean_loss(shards, plain):
 
 
 def test_long_gradients_are_cut(shards, plain, tmp_path):
-    """Adam of one step is deaf to scale, so the moments tell: the first is a tenth of the cut gradient."""
+    """A step of Adam does not depend on scale, but its first moment does: a tenth of the clipped gradient."""
     run(configure(shards, steps=1, batch=4, clip_norm=0.01), tmp_path)
     assert events(tmp_path, "step")[0]["gradient_norm"] == pytest.approx(events(plain, "step")[0]["gradient_norm"])
     _, _, optimiser = end_of(tmp_path)
@@ -99,7 +99,7 @@ def test_an_evaluation_is_what_its_log_says(shards, plain):
 
 @pytest.mark.parametrize("loss_views", ["random", "last"])
 def test_the_loss_of_some_views(shards, tmp_path, loss_views):
-    """Every logged loss, from what the model tells after every view; it learns too slowly to change."""
+    """Every logged loss, from the predictions after every view; the model learns too slowly to change."""
     config = configure(shards, steps=4, batch=4)
     config = dataclasses.replace(
         config,
@@ -188,7 +188,7 @@ def test_depth_is_learnt_and_drawn(tmp_path):
 
 
 def test_the_loss_of_depth_after_a_random_view_is_that_of_the_views_so_far(tmp_path):
-    """Every logged loss, from the first views of the step's batch alone; it learns too slowly to change."""
+    """Every logged loss, from only the first views of the step's batch; the model learns too slowly to change."""
     render_set("synthetic-13", tmp_path / "shards", Recipe(0, 3, 32, (16,)), shapes=13, jobs=1)
     config = TrainingConfig(
         model=ModelConfig(name="depth-lsm", preset="tiny"),
@@ -223,7 +223,7 @@ def test_minutes_end_a_run(shards, tmp_path):
 
 
 def test_minutes_count_over_resumes(shards, tmp_path, monkeypatch):
-    """A run on whose clock every look is a minute later; then the clock stands still."""
+    """A run whose clock advances by a minute at every reading, and then stops."""
 
     def set_clock(now):
         monkeypatch.setattr("lsmgeo.training.run_state.time", mock.Mock(wraps=time, monotonic=now))

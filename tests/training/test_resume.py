@@ -105,7 +105,7 @@ def test_nothing_is_drawn_from_generators_of_all(shards, whole, begun, monkeypat
     assert_same_run(begun, whole)
 
 
-# Four on a machine of two cores are told to be many, and do as they should.
+# Four workers on two cores give a warning that they are many, and work as they should.
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 @pytest.mark.parametrize(
     "changes",
@@ -263,7 +263,7 @@ def test_a_stop_while_a_run_is_planned_leaves_no_plan(timed_config, tmp_path, mo
 
 
 def test_a_configuration_that_knows_more_than_the_checkpoint_is_not_refused(timed, timed_config, tmp_path, monkeypatch):
-    """The plan stands in config.json, and the newest checkpoint that verifies is from before it."""
+    """The plan is in config.json, and the newest checkpoint that verifies is from before it."""
     with cpu_clock(), monkeypatch.context() as patch:
         stop_in(patch, 20)
         run(timed_config, tmp_path)

@@ -1,4 +1,4 @@
-"""A painted sphere in closed form: what every camera sees of it, exactly."""
+"""A painted sphere in closed form: its exact image, depth and surface points in any camera."""
 
 from typing import NamedTuple
 
@@ -10,16 +10,16 @@ from lsmgeo import cameras
 BACKGROUND = 0.9
 
 
-class Picture(NamedTuple):
-    """What cameras with leading shape (...) see of a sphere."""
+class Rendering(NamedTuple):
+    """Renderings of a sphere for cameras with leading shape (...)."""
 
     image: Tensor  # (..., 3, h, w), in [0, 1]
-    depth: Tensor  # (..., h, w), camera z; infinite beside the sphere
-    points: Tensor  # (..., h, w, 3), where the rays meet the sphere; nonsense beside it
+    depth: Tensor  # (..., h, w), camera z; infinite outside the sphere
+    points: Tensor  # (..., h, w, 3), hits of the rays; undefined outside the sphere
 
 
 def paint(points: Tensor, waves: int = 24, wavelength: float = 0.25) -> Tensor:
-    """The colour of places in space (..., 3): a sum of plane waves in random directions, (..., 3) in [0, 1]."""
+    """The colour (..., 3), in [0, 1], of points in space (..., 3): a sum of plane waves in random directions."""
     generator = torch.Generator().manual_seed(7)
     directions = torch.randn(3, waves, 3, generator=generator)
     directions = directions / directions.norm(dim=-1, keepdim=True) * 2 * torch.pi / wavelength
@@ -31,8 +31,8 @@ def paint(points: Tensor, waves: int = 24, wavelength: float = 0.25) -> Tensor:
 
 def look_at_sphere(
     views: cameras.CameraTensors, center: tuple[float, float, float] = (0.0, 0.0, 0.0), radius: float = 0.4, **painting
-) -> Picture:
-    """Meet the ray of every pixel with the sphere, and colour the first meeting point."""
+) -> Rendering:
+    """Intersect the ray of every pixel with the sphere, and colour the first hit."""
     origins, directions = cameras.rays(views)
     offset = (origins - origins.new_tensor(center))[..., None, None, :]
     along = (directions * offset).sum(-1)
@@ -43,4 +43,4 @@ def look_at_sphere(
     forward = views.cam_from_world[..., 2, :3][..., None, None, :]
     depth = torch.where(hit, distance * (directions * forward).sum(-1), torch.inf)
     color = torch.where(hit[..., None], paint(points, **painting), BACKGROUND)
-    return Picture(color.movedim(-1, -3), depth, points)
+    return Rendering(color.movedim(-1, -3), depth, points)

@@ -2,17 +2,16 @@
 What is solid in a mesh with holes?
 ===================================
 
-Meshes made by people are seldom closed: faces are missing where nobody looks, parts overlap, sheets have no thickness.
-Yet a network that learns shape wants a grid of voxels that are solid or empty. One line through a hole says nothing
-right; but it crosses the surface once too often or too seldom, so it is *known* to be wrong. It abstains, and lines in
-twelve other directions vote.
+Modelled meshes are seldom closed: hidden faces are missing, parts overlap, sheets have no thickness. Yet a network that
+learns shape needs voxels that are solid or empty. A line through a hole gives a wrong answer; but its number of
+crossings is odd, so it is *known* to be wrong. It abstains, and lines in twelve other directions vote.
 
-The fork lift is by TheGIWI, given to the public domain (CC0) on Blend Swap.
+The fork lift is by TheGIWI, in the public domain (CC0), from Blend Swap.
 """
 
 # %%
-# The mesh, its box centred and its diagonal scaled to 1, as ShapeNet has it, and three images of one call: colour
-# with shadows, depth, and normals.
+# The mesh, with its box centred and its diagonal scaled to 1 as in ShapeNet, and three images of one call: colour with
+# shadows, depth, and normals.
 
 from pathlib import Path
 
@@ -30,7 +29,7 @@ lights = scenes.Lights(towards, torch.tensor([[0.75] * 3, [0.15] * 3]), torch.fu
 image = data.render_mesh(mesh, view, lights)
 
 # %%
-# A tenth of its faces is taken away at random. Which voxels are solid now?
+# A random tenth of its faces is removed. Which voxels are solid now?
 
 kept = np.random.default_rng(0).random(len(mesh.faces)) >= 0.1
 holed = data.Mesh(mesh.vertices, mesh.faces[kept], mesh.face_colours[kept])
@@ -43,10 +42,10 @@ def overlap(first: torch.Tensor, second: torch.Tensor) -> float:
 whole = data.voxelise(mesh, 64)
 print(f"{int(whole.sum())} voxels of 64^3 are solid")
 voted = data.voxelise(holed, 64)
-print(f"a tenth of the faces less, and the voxels overlap by {overlap(whole, voted):.3f}")
+print(f"without a tenth of the faces, the IoU of the voxels is {overlap(whole, voted):.3f}")
 
 # %%
-# Voxels are drawn by the same renderer: the sides that two of them do not share are a mesh of squares.
+# The same renderer draws the voxels: their free sides are a mesh of squares.
 
 
 def voxel_mesh(solid: torch.Tensor) -> data.Mesh:
@@ -58,7 +57,7 @@ def voxel_mesh(solid: torch.Tensor) -> data.Mesh:
             free = cells & ~np.roll(cells, -step, axis)
             middle = np.argwhere(free) - 0.5 + 0.5 * step * np.eye(3)[axis]
             squares.append(middle[:, None] + np.stack((-u - v, u - v, u + v, v - u)))
-            tints.append(np.where(np.argwhere(free).sum(1, keepdims=True) % 2, 0.62, 0.78))  # tells neighbours apart
+            tints.append(np.where(np.argwhere(free).sum(1, keepdims=True) % 2, 0.62, 0.78))  # a checkerboard
     corners = np.concatenate(squares)
     first = 4 * np.arange(len(corners))[:, None]
     faces = np.concatenate((first + np.array([0, 1, 2]), first + np.array([0, 2, 3])))
@@ -78,7 +77,7 @@ show(axes[0, 1], depth, f"depth, {float(depth[image.mask[0]].min()):.2f} to {flo
 normals = torch.where(image.mask[0], 0.5 + 0.5 * image.normals[0], 1.0)
 show(axes[0, 2], normals.permute(1, 2, 0), "normals")
 show(axes[1, 0], data.render_mesh(holed, view, lights).images[0].permute(1, 2, 0), "a tenth of its faces missing")
-for axis, solid, title in ((axes[1, 1], whole, "voxels of the whole mesh"), (axes[1, 2], voted, "of what is left")):
+for axis, solid, title in ((axes[1, 1], whole, "voxels of the whole mesh"), (axes[1, 2], voted, "voxels of the rest")):
     blocks = data.render_mesh(voxel_mesh(solid), view, lights, smooth=False)
     show(axis, blocks.images[0].permute(1, 2, 0), title)
 plt.show()

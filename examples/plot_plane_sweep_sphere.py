@@ -1,16 +1,16 @@
 """
-How deep is a solid, seen from a camera?
-========================================
+What is the depth of a solid in a camera?
+=========================================
 
-`PlaneSweepProject` cuts the rays of a camera by planes of constant depth and reads a volume where they meet. Along
-each ray the first place where the volume turns solid is what the camera sees. Here the volume is a ball, and the
-exact depth of each pixel is that of the ray through it.
+`PlaneSweepProject` intersects the rays of a camera with planes of constant depth and samples a volume there. Along each
+ray, the camera sees the first point at which the volume becomes solid. Here the volume is a ball, so the exact depth of
+each pixel is known.
 """
 
 # %%
-# The volume holds how solid each of 64^3 voxels is: 1 inside, 0 outside, a ramp of two voxels between, 1/2 on the
-# surface. The sweep has 96 planes between depth 1.4 and 2.2, for maps of 90 x 120 pixels. The cameras' own image is
-# four times that size; no intrinsics are touched.
+# The volume is the occupancy of 64^3 voxels: 1 inside, 0 outside, with a ramp of two voxels between, 1/2 on the
+# surface. The sweep has 96 planes between depth 1.4 and 2.2, for maps of 90 x 120 pixels. The cameras' own images are
+# four times as wide and high; the intrinsics are not changed by hand.
 
 import matplotlib.pyplot as plt
 import torch
@@ -29,9 +29,9 @@ maps, visible = project(solid, views)
 print("maps", tuple(maps.shape), "visible", tuple(visible.shape))
 
 # %%
-# Front to back: the first plane at which the volume is more solid than not, and between it and the plane before, the
-# place where the linear ramp passes 1/2. Rays that graze the ball end half-solid between two voxels; they are left
-# out by asking the exact ray to enter the ball at an angle of at least 15 degrees to its surface.
+# Front to back: the first plane with a value above 1/2, and between it and the previous plane, the point where the
+# linear ramp is 1/2. Grazing rays may stay below 1/2 between voxels; only rays that enter the ball at an angle of at
+# least about 15 degrees to its surface are compared.
 
 values = maps[:, :, 0]  # (B, V, P, h, w)
 after = (values > 0.5).int().argmax(2, keepdim=True).clamp_min(1)  # first plane inside
@@ -49,8 +49,8 @@ print(f"planes are {spacing:.5f} apart")
 print(f"depth error: median {error.nanmedian():.5f}, largest {error[surface].max():.5f} (exact: 0)")
 
 # %%
-# What the sweep holds: the values along one row of pixels, planes upwards. The exact depth of the row lies on the
-# edge of the solid. Beside it, the depth that was read off, and its error.
+# The values of the sweep along one row of pixels, with planes upwards. The exact depth of the row is on the edge of the
+# solid. Beside it, the measured depth and its error.
 
 figure, axes = plt.subplots(1, 3, figsize=(11.5, 3.5), layout="constrained")
 axes[0].imshow(
@@ -60,7 +60,7 @@ axes[0].plot(exact.depth[0, 0, 45], color="tab:red", ls="--", label="exact depth
 axes[0].set(title="the sweep, row 45", xlabel="pixel", ylabel="depth")
 axes[0].legend(loc="lower left")
 shown = axes[1].imshow(torch.where(surface, depth, torch.nan)[0, 0], cmap="viridis")
-axes[1].set(title="depth read off the sweep", xticks=[], yticks=[])
+axes[1].set(title="measured depth", xticks=[], yticks=[])
 figure.colorbar(shown, ax=axes[1])
 shown = axes[2].imshow(error[0, 0] / spacing, cmap="magma", vmin=0)
 axes[2].set(title="error, in plane spacings", xticks=[], yticks=[])
@@ -71,6 +71,6 @@ plt.show()
 # :mod:`lsmgeo.rays` has the differentiable forms of the last step: `composite` for opacities, `expected_depth` for
 # scores.
 
-seen = rays.composite(values, values[:, :, None], depths, visible)
-mean_depth = seen.depth / (1 - seen.transmittance)
+composited = rays.composite(values, values[:, :, None], depths, visible)
+mean_depth = composited.depth / (1 - composited.transmittance)
 print(f"composited depth, median error: {(mean_depth - exact.depth)[surface].abs().median():.5f}")

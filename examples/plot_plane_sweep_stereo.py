@@ -2,14 +2,14 @@
 How does a plane sweep find depth?
 ==================================
 
-Put a plane in front of a camera, at a guessed depth, and paint it with what a second camera sees there. Where the guess
-is right the painting looks like the first camera's photograph; elsewhere it does not. `lsmgeo.classical.sweep` tries
-many guesses and keeps, for every pixel, the one that fits best :cite:p:`collins1996space`.
+Put a plane in front of a camera, at a hypothetical depth, and project a second camera's photo onto it. Where the depth
+is right, the result looks like the first camera's photo; elsewhere it does not. `lsmgeo.classical.sweep` tries many
+depths and keeps, for every pixel, the one that fits best :cite:p:`collins1996space`.
 """
 
 # %%
-# Five photographs of a painted ball before a wall; the first is the one whose depth is wanted. Depth is exact in an
-# analytic scene.
+# Five photos of a painted ball in front of a wall. The sweep computes the depth of the first; its exact depth is that
+# of the analytic scene.
 
 import matplotlib.pyplot as plt
 import torch
@@ -25,8 +25,8 @@ scene = scenes.Scene(
 azimuth, elevation = torch.tensor([90.0, 80.0, 100.0, 90.0, 90.0]), torch.tensor([0.0, 0.0, 0.0, 10.0, -10.0])
 views = cameras.orbit(azimuth, elevation, 2.0, focal_length=200.0, height=120, width=160)
 lights = scenes.Lights(torch.zeros(0, 3), torch.zeros(0, 3), torch.ones(3))  # no shading: only the paint
-seen = scenes.render([scene], views.at(None), lights)
-images, truth = seen.images[0], seen.depth[0, 0]
+rendering = scenes.render([scene], views.at(None), lights)
+images, truth = rendering.images[0], rendering.depth[0, 0]
 
 # %%
 # The sweep. Planes are even in inverse depth, so that a step moves the neighbours' samples about equally everywhere.
@@ -38,9 +38,9 @@ relative = (found.depth - truth).abs() / truth
 print(f"median relative error of all pixels: {relative.median():.5f}; within 25 %: {100 * errors.delta1:.1f} %")
 
 # %%
-# What happens along one ray: that of a pixel beside the ball, which hides this piece of the wall from the camera on the
-# left. Every neighbour has a cost at every plane, one minus the correlation of 5 x 5 patches. At the exact depth the
-# camera on the left disagrees; the mean of the better half of the neighbours does not mind.
+# The costs along one ray: that of a pixel beside the ball, which occludes this part of the wall in the left camera.
+# Every neighbour has a cost at every plane, one minus the correlation of 5 x 5 patches. At the exact depth the left
+# camera disagrees; the mean of the better half of the neighbours is not affected.
 
 row, column = 60, 115
 costs, visible = matching_costs(images, views, planes)
@@ -55,8 +55,8 @@ figure.legend(fontsize=8, loc="outside right upper")
 plt.show()
 
 # %%
-# The confidence says how low the winner is, how far above the next best place is, and whether the pixels around agree.
-# Gross errors are all at the ball's edge, where a patch holds both depths, and the confidence knows it.
+# The confidence combines how low the winning cost is, how much higher the next minimum is, and whether neighbouring
+# pixels agree. Gross errors are all at the ball's edge, where a patch contains both depths, and have low confidence.
 
 densities = [0.5, 0.8, 0.9, 0.95, 0.98]
 curve = metrics.density_curve(relative, found.confidence, densities, statistic="bad", threshold=0.02)
@@ -67,11 +67,11 @@ for density, error in zip(curve.density, curve.error, strict=True):
 figure, axes = plt.subplots(2, 3, figsize=(11, 5.8), layout="constrained")
 axes[0, 0].imshow(images[0].permute(1, 2, 0))
 axes[0, 0].plot(column, row, "rx")
-axes[0, 0].set_title("the photograph, that pixel")
+axes[0, 0].set_title("the photo and that pixel")
 shown = axes[0, 1].imshow(truth, cmap="turbo_r", vmin=1.5, vmax=2.7)
 axes[0, 1].set_title("exact depth")
 axes[0, 2].imshow(found.depth, cmap="turbo_r", vmin=1.5, vmax=2.7)
-axes[0, 2].set_title("depth that was found")
+axes[0, 2].set_title("estimated depth")
 figure.colorbar(shown, ax=axes[0, 1:])
 shown = axes[1, 0].imshow(found.confidence, cmap="gray", vmin=0, vmax=1)
 axes[1, 0].set_title("confidence")

@@ -2,16 +2,15 @@
 Where do two views agree?
 =========================
 
-A place on the surface looks alike from everywhere; a place in front of it or behind it shows each view another part
-of the surface. So the variance between views is small where the surface is, and that is the whole idea of multi-view
-stereo.
+A point on the surface has the same colour in all views; at a point in front of it or behind it, each view sees a
+different part of the surface. So the variance between views is small at the surface: the idea of multi-view stereo.
 
 Two cameras, 30 degrees apart, look at a painted sphere of radius 0.4. The exact answer is 0.4.
 """
 
 # %%
-# The grid is unprojected from both views and reduced on the way: ``reduce="variance"`` never holds the volumes of the
-# views. With ``padding_mode="border"`` the edge of a picture does not pretend to be dark.
+# Both views are unprojected and reduced in one pass: ``reduce="variance"`` never holds the volumes of the views. With
+# ``padding_mode="border"`` colours do not fade at the edge of an image.
 
 import matplotlib.pyplot as plt
 import torch
@@ -20,30 +19,30 @@ from analytic_scene import look_at_sphere
 from lsmgeo import Unproject, VoxelGrid, cameras, functional
 
 views = cameras.orbit(torch.tensor([[75.0, 105.0]]), 0.0, 2.0, focal_length=280.0, height=128, width=160)
-picture = look_at_sphere(views, radius=0.4)
+rendering = look_at_sphere(views, radius=0.4)
 
 unproject = Unproject(VoxelGrid(128), reduce="variance", padding_mode="border")
-variance, visible = unproject(picture.image, views)
+variance, visible = unproject(rendering.image, views)
 print("variance", tuple(variance.shape))
 
 # %%
-# The number: walk outwards from the sphere's centre along a thousand directions that both cameras see, and note the
-# radius at which the two views agree best.
+# The number: along a thousand directions from the sphere's centre that both cameras see, the radius at which the two
+# views agree best.
 
 generator = torch.Generator().manual_seed(0)
 directions = torch.tensor([0.0, 0.0, 1.0]) + 0.35 * torch.randn(1000, 3, generator=generator)
 directions = torch.nn.functional.normalize(directions, dim=-1)
 radii = torch.linspace(0.3, 0.5, 201)
 points = (radii[:, None] * directions[:, None]).reshape(1, -1, 3)
-cost = functional.unproject_points(picture.image, views, points, reduce="variance", padding_mode="border").volume
+cost = functional.unproject_points(rendering.image, views, points, reduce="variance", padding_mode="border").volume
 cost = cost.sum(1).reshape(1000, 201)
 best = radii[cost.argmin(1)]
 print(f"radius of best agreement: median {best.median():.4f} (exact: 0.4000)")
 
 # %%
-# On the left, the horizontal slice through the centre, from above: dark where the views agree. The dark arc is the
-# part of the sphere that both cameras see. Where both see background, beside the sphere, they agree too: agreement
-# alone is not yet a surface. On the right, the disagreement along the thousand directions.
+# On the left, the horizontal slice through the centre, from above: dark where the views agree. The dark arc is the part
+# of the sphere that both cameras see. Beside the sphere both see background and agree too: agreement does not imply a
+# surface. On the right, the disagreement along the thousand directions.
 
 figure, axes = plt.subplots(1, 2, figsize=(10.5, 4.4), layout="constrained")
 deviation = variance[0, :, :, 64].sum(0).sqrt()  # (z, x) at y = 0

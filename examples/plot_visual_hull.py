@@ -2,14 +2,14 @@
 What can silhouettes never show?
 ================================
 
-Every silhouette says where the object is *not*: outside its outline. What no view excludes is the visual hull
-:cite:p:`laurentini1994visual`. It shrinks with every view, but never down to the object: a hollow that reaches no
-outline stays filled.
+A silhouette excludes the space outside it. The space that no view excludes is the visual hull
+:cite:p:`laurentini1994visual`. It shrinks with every view, but never to the object: a hollow that no silhouette
+shows stays filled.
 """
 
 # %%
-# A cup on a foot, hollowed out from above. Cameras go around it, between 10 degrees below and 30 above. Each sees its
-# silhouette, and voxels say exactly what is solid: in the cup, and in the same cup without the hollow.
+# A cup on a foot, hollow from above. Cameras surround it, between 10 degrees below and 30 above, and each has a
+# silhouette. The exact voxels of the cup, and of the same cup without the hollow, are known.
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -25,8 +25,8 @@ hollow = scenes.cone((0, 0.39, 0), (0, -0.14, 0), 0.30, 0.20)
 cup, full = scenes.Scene([body.minus(hollow), foot]), scenes.Scene([body, foot])
 
 count = 24
-turns = torch.arange(count) * 137.5 % 360  # any first few of these stand well around
-views = cameras.orbit(turns, torch.linspace(0, 1, count) * 40 - 10, 2.0, focal_length=280.0, height=160, width=160)
+azimuths = torch.arange(count) * 137.5 % 360  # any first few of these are well distributed
+views = cameras.orbit(azimuths, torch.linspace(0, 1, count) * 40 - 10, 2.0, focal_length=280.0, height=160, width=160)
 lights = scenes.Lights(torch.tensor([[0.3, 0.9, 0.3]]), torch.full((1, 3), 0.6), torch.full((3,), 0.3))
 masks = scenes.render([cup], views.at(None), lights).mask[0]
 
@@ -34,28 +34,28 @@ grid = VoxelGrid(64)
 solid, filled = (scenes.voxels([scene], grid)[0] for scene in (cup, full))
 
 # %%
-# Carving by the first few views, by strict intersection: a voxel stays if all silhouettes hold it. Said in distances to
-# the outlines: if the least of them is above 0; from a field of distances comes a smooth surface.
+# Carving by the first few views, by strict intersection: a voxel stays if it is in all silhouettes, that is, if the
+# least of its signed distances to the silhouettes' outlines is above 0. A field of distances gives a smooth surface.
 
-outlines = torch.stack([signed_distance(mask) for mask in masks])
+distances = torch.stack([signed_distance(mask) for mask in masks])
 numbers = (1, 2, 3, 4, 6, 8, 12, 24)
 hulls = {}
 print("views  IoU with the cup  IoU with the cup filled  hollow filled")
 for number in numbers:
     first = views.at(slice(number))
-    hull = hulls[number] = visual_hull(outlines[:number], first, grid, rule="all", threshold=0.0)
+    hull = hulls[number] = visual_hull(distances[:number], first, grid, rule="all", threshold=0.0)
     scores = [float(metrics.voxel_iou(hull.occupancy, truth)) for truth in (solid, filled)]
     inside = float(hull.occupancy[filled & ~solid].float().mean())
     print(f"{number:5}  {scores[0]:16.3f}  {scores[1]:23.3f}  {100 * inside:11.1f} %")
 
 # %%
-# The slice through the cup's axis says the same: everything outside goes, the hollow stays. Only colours that change
-# from view to view, as in a plane sweep, could carve it.
+# The slice through the cup's axis shows it: everything outside is carved away, the hollow stays filled. Only colours,
+# as in a plane sweep, could carve it.
 
 figure, axes = plt.subplots(2, 4, figsize=(11.5, 5.8), layout="constrained")
 eye = cameras.orbit(torch.tensor([40.0]), 35.0, 2.0, focal_length=420.0, height=240, width=240)
-picture = scenes.render([cup], eye.at(None), lights, shadows=True)
-axes[0, 0].imshow(picture.images[0, 0].permute(1, 2, 0))
+rendering = scenes.render([cup], eye.at(None), lights, shadows=True)
+axes[0, 0].imshow(rendering.images[0, 0].permute(1, 2, 0))
 axes[0, 0].set_title("the cup")
 axes[1, 0].imshow(masks[7], cmap="gray_r")
 axes[1, 0].set_title("one of its silhouettes")

@@ -1,14 +1,13 @@
 """
-Can these cameras be believed?
-==============================
+Are these cameras right?
+========================
 
-A folder of photographs came with 4 x 4 matrices. Somebody says that they take the world to the camera. Nothing in a
-matrix can tell: its inverse is as good a matrix. The photographs can.
+A folder of photos has 4 x 4 matrices that are said to be world-to-camera. The matrices cannot confirm it, because their
+inverses are equally valid poses. The photos can.
 """
 
 # %%
-# Six pictures of a drawn scene stand for the photographs. Their cameras are known, and are inverted before anybody
-# looks: the most frequent mistake of all.
+# Six renderings replace the photos. Their cameras are known, and are inverted here: the most common error of all.
 
 import tempfile
 from pathlib import Path
@@ -34,24 +33,24 @@ sun = scenes.Lights(torch.tensor([[0.4, 1.0, 0.5]]), torch.full((1, 3), 0.6), to
 middle = (1.0, 0.0, 0.5)
 azimuths = torch.linspace(0.0, 60.0, 6, dtype=torch.float64)
 views = cameras.orbit(azimuths, 28.0, 2.2, focal_length=330.0, height=240, width=320, target=middle)
-picture = scenes.render([scene], cameras.stack([views]), sun)
+rendering = scenes.render([scene], cameras.stack([views]), sun)
 
 scratch = tempfile.TemporaryDirectory()
 folder = Path(scratch.name)
-paths = [folder / f"{view}.png" for view in range(len(picture.images[0]))]
-for path, image in zip(paths, picture.images[0], strict=True):
+paths = [folder / f"{view}.png" for view in range(len(rendering.images[0]))]
+for path, image in zip(paths, rendering.images[0], strict=True):
     plt.imsave(path, image.movedim(0, -1).numpy())
 names = tuple(path.name for path in paths)
 
-mistaken = views._replace(cam_from_world=torch.linalg.inv(views.cam_from_world))
-photographs = data.PosedImages(names, tuple(paths), mistaken, None, "drawn")
+inverted = views._replace(cam_from_world=torch.linalg.inv(views.cam_from_world))
+photos = data.PosedImages(names, tuple(paths), inverted, None, "drawn")
 
 # %%
-# Features are matched without the cameras, and then compared with them: how far is a feature from the epipolar line of
-# its match? Where that is too far, every usual mistake is undone in turn, and everything is measured again.
-# ``lsmgeo info`` prints this for whatever it is given.
+# Features are matched without the cameras, and then compared with them: what is the distance of a feature from the
+# epipolar line of its match? If it is too large, every common error is corrected in turn, and everything is measured
+# again. ``lsmgeo info`` prints this for any scene.
 
-findings = diagnosis.examine(photographs, folder)
+findings = diagnosis.examine(photos, folder)
 for check in findings.checks:
     state = "ok" if check.passed else "FAILED"
     print(
@@ -61,22 +60,23 @@ print(f"verdict: {findings.verdict}, {findings.cause.name}")
 print(f"because: {findings.cause.evidence}")
 
 # %%
-# The cure is one line, and the same examination says that it was one.
+# The correction is one line, and the same examination confirms it.
 
-mended = mistaken._replace(cam_from_world=torch.linalg.inv(mistaken.cam_from_world))
-after = diagnosis.examine(data.PosedImages(names, tuple(paths), mended, None, "drawn"), folder)
+corrected = inverted._replace(cam_from_world=torch.linalg.inv(inverted.cam_from_world))
+after = diagnosis.examine(data.PosedImages(names, tuple(paths), corrected, None, "drawn"), folder)
 print(
     f"epipolar error: {findings.checks[0].value:.1f} px before, {after.checks[0].value:.3f} px after ({after.verdict})"
 )
 
 # %%
-# From above; the cross is what they look at. Inverted, the cameras of a ring stand closer together, somewhere else.
+# The cameras from above; the cross is the point they look at. Inverted, the cameras of a ring are closer together and
+# elsewhere.
 
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained", width_ratios=(1.3, 1, 1))
-axes[0].imshow(picture.images[0, 2].movedim(0, -1))
-axes[0].set_title("one of six photographs")
+axes[0].imshow(rendering.images[0, 2].movedim(0, -1))
+axes[0].set_title("one of six photos")
 axes[0].axis("off")
-for axis, shown, title in ((axes[1], mistaken, "cameras as they came"), (axes[2], mended, "mended")):
+for axis, shown, title in ((axes[1], inverted, "cameras as given"), (axes[2], corrected, "corrected")):
     world_from_cam = torch.linalg.inv(shown.cam_from_world)
     x, _, z = world_from_cam[:, :3, 3].unbind(-1)
     ahead = world_from_cam[:, :3, 2]

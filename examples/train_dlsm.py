@@ -1,11 +1,11 @@
-"""Train a small D-LSM and measure the depth that it sees in pictures of shapes that it was not trained on.
+"""Train a small D-LSM and measure its depth error on unseen shapes.
 
-Everything is rendered here: no data are needed. Run from the root of the repository::
+The data are rendered here. Run from the root of the repository::
 
     python examples/train_dlsm.py runs/dlsm_example
 
-It takes a minute or two; depth worth having takes hours (examples/configs/dlsm_compact.toml). Run again, it goes on
-where it was.
+It takes a minute or two; useful depth takes hours (examples/configs/dlsm_compact.toml). The same command continues an
+interrupted run.
 """
 
 import sys
@@ -30,9 +30,9 @@ trained = train(config, f"{out}/run")
 print(f"{trained.step} steps, {trained.checkpoint}")
 
 model = load(trained.checkpoint)
-held_back = ShapeDataset(ShardSet(f"{out}/shards"), views=4, split="test", depth=True, occupancy=None)
-batch = collate([held_back[index] for index in range(4)])
+unseen = ShapeDataset(ShardSet(f"{out}/shards"), views=4, split="test", depth=True, occupancy=None)
+batch = collate([unseen[index] for index in range(4)])
 depth = model.run(batch.images, batch.cameras).depth
 error = median_depth_error(depth, batch.depth, batch.mask).error.nanmean(1)
 print(f"median depth error: {', '.join(f'{value:.3f}' for value in error)} of {', '.join(batch.category)}")
-print(f"of a depth of 2 everywhere: {median_depth_error(depth * 0 + 2, batch.depth).error.nanmean():.3f}")
+print(f"of a constant depth of 2: {median_depth_error(depth * 0 + 2, batch.depth).error.nanmean():.3f}")

@@ -1,11 +1,11 @@
-"""Train a small V-LSM and look at what it makes of shapes that it was not trained on.
+"""Train a small V-LSM and measure its IoU on unseen shapes.
 
-Everything is rendered here: no data are needed. Run from the root of the repository::
+The data are rendered here. Run from the root of the repository::
 
     python examples/train_vlsm.py runs/vlsm_example
 
-It takes a minute or two, and the shapes it makes are blobs: good ones take half an hour
-(examples/configs/vlsm_compact.toml) and more. Run again, it goes on where it was.
+It takes a minute or two, and predicts blobs: good shapes take half an hour (examples/configs/vlsm_compact.toml) and
+more. The same command continues an interrupted run.
 """
 
 import sys
@@ -32,8 +32,8 @@ trained = train(config, f"{out}/run")
 print(f"{trained.step} steps, {trained.checkpoint}")
 
 model = load(trained.checkpoint)
-held_back = ShapeDataset(ShardSet(f"{out}/shards"), views=4, split="test", depth=False, occupancy=model.resolution)
-batch = collate([held_back[index] for index in range(4)])
+unseen = ShapeDataset(ShardSet(f"{out}/shards"), views=4, split="test", depth=False, occupancy=model.resolution)
+batch = collate([unseen[index] for index in range(4)])
 result = model.run(batch.images, batch.cameras)
 for view in range(4):
     iou = voxel_iou(result.by_view[:, view], batch.occupancy)

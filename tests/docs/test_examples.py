@@ -61,7 +61,7 @@ def test_a_sweep_of_photographs_is_right_to_a_thousandth_and_knows_where(run):
 def test_planes_a_pixel_apart_are_nearly_enough_and_depths_out_of_range_are_lost(run):
     names = run("depth_range")
     inverse, depth = names["curves"]["inverse"], names["curves"]["depth"]
-    assert 16 < names["told"] < 32
+    assert 16 < names["pixel_planes"] < 32
     assert inverse[0] > 0.5 > 2 * inverse[2]
     assert inverse[2] - inverse[4] < 0.03
     assert all(even < uneven for even, uneven in zip(inverse[:4], depth[:4], strict=True))

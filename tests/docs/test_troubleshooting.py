@@ -89,7 +89,7 @@ def test_the_correction_fixes_the_error(name):
         "height": HEIGHT,
         "width": WIDTH,
         "names_of_cameras": ["c", "a", "b"],
-        "names_of_photographs": ["a", "b", "c"],
+        "names_of_photos": ["a", "b", "c"],
     }
     assert not torch.equal(names["views"].cam_from_world, expected.cam_from_world) or not torch.equal(
         names["views"].intrinsics, expected.intrinsics

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -64,15 +64,7 @@ def surface_of(voxels: Voxels) -> Content:
 
 
 def draw_cameras(figure: Figure, cameras: Geometry, content: Content, sizes: np.ndarray, colours: np.ndarray) -> None:
-    """Draw cameras from above and from the side.
-
-    Args:
-        figure: the figure to draw in.
-        cameras: the cameras.
-        content: the content of the scene.
-        sizes: (V, 2) height and width of the images.
-        colours: (V, 3) of the cameras.
-    """
+    """Draw cameras from above and from the side; sizes (V, 2) are height and width, colours (V, 3) of the cameras."""
     above, side, coordinates = _views(cameras)
     words = f"thick: the upper side of the image; dotted: the optical axis; {coordinates}"
     figure.supxlabel(words, fontsize=9)
@@ -229,7 +221,8 @@ def _number_cameras(axes: Axes, cameras: Geometry, view: _View) -> None:
     placed = view.project(cameras.centers)[:, :2]
     points = placed * _points_per_unit(axes)
     back = -(np.linalg.inv(cameras.R)[:, :, 2] @ view.system.T)[:, :2]
-    stroke = [withStroke(linewidth=2, foreground="white")]
+    style: Any = {"textcoords": "offset points", "fontsize": FONT_SIZE, "ha": "center", "va": "center", "zorder": 6}
+    style["path_effects"] = [withStroke(linewidth=2, foreground="white")]
     written: list[tuple[np.ndarray, float]] = []
     for camera, direction in enumerate(back):
         length = np.linalg.norm(direction)
@@ -241,17 +234,7 @@ def _number_cameras(axes: Axes, cameras: Geometry, view: _View) -> None:
             place = points[camera] + offset
             apart = [np.abs(place - other) / [(width + wide) / 2 + 1, FONT_SIZE] for other, wide in written]
             if all(gap.max() > 1 for gap in apart):
-                axes.annotate(
-                    str(camera),
-                    placed[camera],
-                    (float(offset[0]), float(offset[1])),
-                    textcoords="offset points",
-                    fontsize=FONT_SIZE,
-                    ha="center",
-                    va="center",
-                    path_effects=stroke,
-                    zorder=6,
-                )
+                axes.annotate(str(camera), placed[camera], (float(offset[0]), float(offset[1])), **style)
                 written.append((place, width))
                 break
 

@@ -27,102 +27,55 @@ UNITS = (1000.0, 100.0, 10.0, 5.0, 25.4, 2.54, 4.0, 2.0, 256.0)
 
 
 class Candidate(NamedTuple):
-    """A possible error.
-
-    Attributes:
-        name: the error's short name.
-        correction: the correction in words, such as "inverted".
-        remedy: what to do, one sentence.
-        hypothesis: the corrected geometry.
-    """
+    """A possible error."""
 
     name: str
-    correction: str
-    remedy: str
-    hypothesis: Hypothesis
+    correction: str  # in words, such as "inverted"
+    remedy: str  # what to do, one sentence
+    hypothesis: Hypothesis  # the corrected geometry
 
 
 def camera_candidates(stated: Hypothesis, sizes: np.ndarray) -> list[Candidate]:
-    """Errors that affect all cameras alike, common ones first.
+    """Errors that affect all cameras alike, common ones first; sizes (V, 2) are height and width of the images."""
+    found: list[Candidate] = []
 
-    Args:
-        stated: the cameras that the scene states.
-        sizes: (V, 2) height and width of the images.
-    """
+    def add(name: str, correction: str, remedy: str, change: Callable[[Geometry], Geometry]) -> None:
+        found.append(Candidate(name, correction, remedy, _both(stated, change)))
+
     inverse = (
         "The poses are camera-to-world and are used as world-to-camera: invert the 4 x 4 matrices "
         "(R^T and -R^T t), or read them as camera-to-world."
     )
+    add("poses inverted", "inverted", inverse, _inverted)
     opengl = (
         "The cameras' axes are OpenGL's (y up, z backwards): negate the second and third row of world-to-camera, "
         "or use lsmgeo.cameras.from_opengl."
     )
-    flipped = "y points the other way: {}."
-    table: list[tuple[str, str, str, Callable[[Geometry], Geometry]]] = [
-        ("poses inverted", "inverted", inverse, _inverted),
-        ("OpenGL axes", "with y and z negated", opengl, lambda cameras: _rotated(cameras, OPENGL)),
-        (
-            "y flipped",
-            "with the cameras' and the world's y negated",
-            flipped.format("negate it in the cameras and in the world, which is left-handed here"),
-            lambda cameras: _rotated(cameras._replace(R=cameras.R @ FLIP), FLIP),
-        ),
-        (
-            "y flipped",
-            "with the images upside down",
-            flipped.format("the rows of the images are stored from the bottom up; flip them"),
-            lambda cameras: _flipped(cameras, sizes, 1),
-        ),
-        (
-            "y flipped",
-            "with the cameras' y negated",
-            flipped.format("negate the second row of world-to-camera"),
-            lambda cameras: _rotated(cameras, FLIP),
-        ),
-        (
-            "poses inverted and OpenGL axes",
-            "inverted, then with y and z negated",
-            f"{inverse} {opengl}",
-            lambda cameras: _rotated(_inverted(cameras), OPENGL),
-        ),
-        (
-            "poses inverted and OpenGL axes",
-            "with y and z negated, then inverted",
-            f"{opengl} {inverse}",
-            lambda cameras: _inverted(_rotated(cameras, OPENGL)),
-        ),
-        (
-            "rotation transposed",
-            "with every rotation transposed",
-            "The rotations are camera-to-world and the translations are not: transpose the rotations.",
-            lambda cameras: cameras._replace(R=np.linalg.inv(cameras.R)),
-        ),
-        (
-            "centre taken as translation",
-            "with t = -R C",
-            "The camera centre C is used as the translation: t is -R C.",
-            lambda cameras: cameras._replace(t=-np.einsum("vij,vj->vi", cameras.R, cameras.t)),
-        ),
-        (
-            "translation negated",
-            "with t negated",
-            "The translations have the wrong sign: negate them.",
-            lambda cameras: cameras._replace(t=-cameras.t),
-        ),
-        (
-            "x flipped",
-            "with the images mirrored",
-            "The images are mirrored left to right, or the cameras' x points left: mirror them back.",
-            lambda cameras: _flipped(cameras, sizes, 0),
-        ),
-    ]
-    found = [Candidate(*row[:3], _both(stated, row[3])) for row in table]
+    add("OpenGL axes", "with y and z negated", opengl, lambda c: _rotated(c, OPENGL))
+    remedy = "y points the other way: negate it in the cameras and in the world, which is left-handed here."
+    both = "with the cameras' and the world's y negated"
+    add("y flipped", both, remedy, lambda c: _rotated(c._replace(R=c.R @ FLIP), FLIP))
+    remedy = "y points the other way: the rows of the images are stored from the bottom up; flip them."
+    add("y flipped", "with the images upside down", remedy, lambda c: _flipped(c, sizes, 1))
+    remedy = "y points the other way: negate the second row of world-to-camera."
+    add("y flipped", "with the cameras' y negated", remedy, lambda c: _rotated(c, FLIP))
+    name = "poses inverted and OpenGL axes"
+    add(name, "inverted, then with y and z negated", f"{inverse} {opengl}", lambda c: _rotated(_inverted(c), OPENGL))
+    add(name, "with y and z negated, then inverted", f"{opengl} {inverse}", lambda c: _inverted(_rotated(c, OPENGL)))
+    remedy = "The rotations are camera-to-world and the translations are not: transpose the rotations."
+    add("rotation transposed", "with every rotation transposed", remedy, lambda c: c._replace(R=np.linalg.inv(c.R)))
+    remedy = "The camera centre C is used as the translation: t is -R C."
+    name, correction = "centre taken as translation", "with t = -R C"
+    add(name, correction, remedy, lambda c: c._replace(t=-np.einsum("vij,vj->vi", c.R, c.t)))
+    remedy = "The translations have the wrong sign: negate them."
+    add("translation negated", "with t negated", remedy, lambda c: c._replace(t=-c.t))
+    remedy = "The images are mirrored left to right, or the cameras' x points left: mirror them back."
+    add("x flipped", "with the images mirrored", remedy, lambda c: _flipped(c, sizes, 0))
     for rotation, words in _other_axes():
         remedy = f"The cameras' x, y, z axes point {words}: bring them to right, down, forward."
-        rotated = _both(stated, partial(_rotated, rotation=rotation))
-        both = _both(stated, lambda cameras, R=rotation: _rotated(_inverted(cameras), R))  # type: ignore[misc]
-        found.append(Candidate("other camera axes", f"with axes {words}", remedy, rotated))
-        found.append(Candidate("other camera axes", f"inverted, with axes {words}", f"{inverse} {remedy}", both))
+        add("other camera axes", f"with axes {words}", remedy, partial(_rotated, rotation=rotation))
+        correction, remedy = f"inverted, with axes {words}", f"{inverse} {remedy}"
+        add("other camera axes", correction, remedy, lambda c, R=rotation: _rotated(_inverted(c), R))  # type: ignore[misc]
     return found
 
 

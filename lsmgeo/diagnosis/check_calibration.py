@@ -305,12 +305,7 @@ def _other_poses(pose: Pose) -> list[tuple[str, str, str, Pose]]:
 
     return [
         ("poses inverted", "inverted", "R and T are in the opposite direction: use R^T and -R^T T.", pose.inverse()),
-        (
-            "OpenGL axes",
-            "with y and z negated",
-            "The axes are OpenGL's: negate both y and z.",
-            in_axes(OPENGL),
-        ),
+        ("OpenGL axes", "with y and z negated", "The axes are OpenGL's: negate both y and z.", in_axes(OPENGL)),
         (
             "OpenGL axes",
             "with the camera's y and z negated",

@@ -125,13 +125,7 @@ def rms(errors: np.ndarray) -> float:
 
 
 def pose_of(lens: CalibratedLens, points: np.ndarray, corners: np.ndarray) -> Pose | None:
-    """Board-to-camera pose in one image, None without a solution.
-
-    Args:
-        lens: the lens of the camera.
-        points: (N, 3) corners of the board.
-        corners: (N, 2) pixels.
-    """
+    """Board-to-camera pose from board corners (N, 3) and their pixels (N, 2) in one image, None without a solution."""
     import cv2
 
     K, distortion = lens.intrinsics, np.array(lens.coefficients)
@@ -196,11 +190,7 @@ def calibrate_stereo(
 ) -> tuple[float, Pose] | None:
     """The rms in pixels and the pose of the second camera relative to the first, with fixed lenses; None if that fails.
 
-    Args:
-        points: (N, 3) corners of the board.
-        lenses: of both cameras, "perspective".
-        pairs: corners in both images of each pair, (N, 2) pixels each.
-        size: (height, width) of the images.
+    Both lenses are "perspective", and the images have one size; for the rest see `transfer_errors`.
     """
     import cv2
 

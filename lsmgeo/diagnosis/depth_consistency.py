@@ -26,19 +26,12 @@ LEAST_OVERLAP = 0.02
 
 
 class Surfaces(NamedTuple):
-    """Depth of V views, subsampled to every ``step``-th row and column.
+    """Depth of V views, subsampled to every ``step``-th row and column."""
 
-    Attributes:
-        maps: each view's (h, w) float64 depth, None for a view without.
-        steps: the distance between kept rows and columns.
-        pixels: each view's (N, 2) x, y of the pixels that are reprojected.
-        depths: their depth.
-    """
-
-    maps: tuple[np.ndarray | None, ...]
-    steps: tuple[int, ...]
-    pixels: tuple[np.ndarray, ...]
-    depths: tuple[np.ndarray, ...]
+    maps: tuple[np.ndarray | None, ...]  # each view's (h, w) float64 depth, None for a view without
+    steps: tuple[int, ...]  # the distance between kept rows and columns
+    pixels: tuple[np.ndarray, ...]  # each view's (N, 2) x, y of the pixels that are reprojected
+    depths: tuple[np.ndarray, ...]  # (N,), their depth
 
     @property
     def views(self) -> list[int]:
@@ -150,12 +143,7 @@ def best_neighbour_errors(surfaces: Surfaces, hypothesis: Hypothesis) -> dict[in
 def warp_errors(
     surfaces: Surfaces, hypothesis: Hypothesis, images: tuple[np.ndarray, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Differences in grey levels between each of two images and the other one, warped by depth and not warped.
-
-    Args:
-        surfaces: of two views.
-        hypothesis: their cameras.
-        images: (H, W) grey, at the original sizes.
+    """Differences in grey levels between each of two images (H, W) and the other one, warped by depth and not warped.
 
     Returns:
         (M,) and (M,) absolute differences at the pixels that project into the other image.

@@ -31,11 +31,6 @@ LONGEST_SIDE = 900
 def draw_examination(scene: PosedImages, examination: Examination, title: str) -> dict[str, tuple[str, bytes]]:
     """Draw the evidence of an examination.
 
-    Args:
-        scene: the images.
-        examination: its result.
-        title: the title of the figures.
-
     Returns:
         For each figure its description, the name of its file, and a PNG.
 

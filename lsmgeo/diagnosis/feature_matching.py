@@ -27,19 +27,12 @@ TOLERANCE = 1.5  # px of the resized image
 
 
 class Matches(NamedTuple):
-    """M matches of P pairs of images.
+    """M matches of P pairs of images."""
 
-    Attributes:
-        first: (P,) int, the pairs' first views.
-        second: (P,) int.
-        pair: (M,) int, the pair of each match, ascending.
-        pixels: (M, 2, 2) x, y in the first and in the second image, at their original sizes.
-    """
-
-    first: np.ndarray
-    second: np.ndarray
-    pair: np.ndarray
-    pixels: np.ndarray
+    first: np.ndarray  # (P,) int, the pairs' first views
+    second: np.ndarray  # (P,) int
+    pair: np.ndarray  # (M,) int, the pair of each match, ascending
+    pixels: np.ndarray  # (M, 2, 2) x, y in the first and in the second image, at their original sizes
 
     def thinned(self, most: int) -> Matches:
         """At most ``most`` matches of each pair, evenly chosen."""
@@ -91,10 +84,6 @@ def match_features(scene: PosedImages, views: np.ndarray) -> Matches:
     Pairs are chosen by the features only: the strongest of every view are compared with those of every other.
     (Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004; Barath et al., "MAGSAC++", CVPR
     2020.)
-
-    Args:
-        scene: the images; each is read once.
-        views: the views to match.
 
     Raises:
         DataError: an image is missing, damaged or not of its camera's size.

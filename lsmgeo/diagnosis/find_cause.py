@@ -52,19 +52,12 @@ NICE = (0.001, 0.01, 0.1, 0.125, 0.2, 0.25, 1 / 3, 0.5, 2 / 3, 0.75, 1.5, 2.0, 3
 
 
 class Explanation(NamedTuple):
-    """An error whose correction makes the checks pass.
+    """An error whose correction makes the checks pass."""
 
-    Attributes:
-        candidate: the error and the corrected geometry.
-        before: the checks for the stated cameras.
-        after: the same checks for the corrected cameras.
-        rivals: the names of other errors that explain the measurements as well.
-    """
-
-    candidate: Candidate
-    before: tuple[Check, ...]
-    after: tuple[Check, ...]
-    rivals: tuple[str, ...]
+    candidate: Candidate  # the error and the corrected geometry
+    before: tuple[Check, ...]  # the checks for the stated cameras
+    after: tuple[Check, ...]  # the same checks for the corrected cameras
+    rivals: tuple[str, ...]  # names of other errors that explain the measurements as well
 
 
 def score(checks: Sequence[Check]) -> float:
@@ -92,18 +85,14 @@ def is_decisive(before: Sequence[Check], after: Sequence[Check]) -> bool:
 
 
 def explain(
-    stated: Hypothesis,
-    evidence: Sequence[Evidence],
-    names: Sequence[str],
-    sizes: np.ndarray,
-    views: np.ndarray,
+    stated: Hypothesis, evidence: Sequence[Evidence], names: Sequence[str], sizes: np.ndarray, views: np.ndarray
 ) -> tuple[Explanation | None, tuple[str, ...]]:
     """Find the error whose correction makes the measured errors decisively smaller.
 
     Args:
         stated: the cameras that the scene states.
         evidence: what can be measured again.
-        names: the images' names.
+        names: those of the images.
         sizes: (V, 2) their height and width.
         views: the views that are measured.
 
@@ -151,13 +140,7 @@ def explain(
 
 
 def invisible_errors(stated: Hypothesis, evidence: Sequence[Evidence], sizes: np.ndarray) -> tuple[str, ...]:
-    """Names of common errors that would pass all checks of this scene.
-
-    Args:
-        stated: the cameras that the scene states, which pass.
-        evidence: what can be measured again.
-        sizes: (V, 2) height and width of the images.
-    """
+    """Names of common errors that would pass all checks of this scene, whose stated cameras pass."""
     candidates = [*camera_candidates(stated, sizes), scaled(stated, np.full(2, 0.5))]
     usual = {candidate.name: candidate.hypothesis for candidate in reversed(candidates) if candidate.name in COMMON[:4]}
     return tuple(name for name in COMMON[:4] if not is_suspicious(_measured(evidence, usual[name])))

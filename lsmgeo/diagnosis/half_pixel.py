@@ -35,20 +35,12 @@ FARTHEST_TANGENT = 1.0  # px
 
 
 class Shift(NamedTuple):
-    """By how much all principal points are too large, px.
+    """By how much all principal points are too large, px."""
 
-    Attributes:
-        source: the evidence it is inferred from.
-        x: along x.
-        y: along y.
-        error_x: standard error of x.
-        error_y: standard error of y.
-    """
-
-    source: str
+    source: str  # the evidence it is inferred from
     x: float
     y: float
-    error_x: float
+    error_x: float  # standard error of x
     error_y: float
 
 

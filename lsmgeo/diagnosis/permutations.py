@@ -34,14 +34,7 @@ LISTED = 4
 def permutation_candidates(
     stated: Hypothesis, names: Sequence[str], evidence: Sequence[Evidence], views: np.ndarray
 ) -> list[Candidate]:
-    """Candidates in which images have other cameras: common permutations, and those that fit the evidence.
-
-    Args:
-        stated: the cameras that the scene states.
-        names: the images' names.
-        evidence: what can be measured.
-        views: the views that are measured.
-    """
+    """Candidates in which images have other cameras: common permutations, and those that fit the evidence."""
     count = len(names)
     fitted = _fitted_permutations(stated, evidence, views)
     found, tried = [], {tuple(range(count))}

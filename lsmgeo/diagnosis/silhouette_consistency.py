@@ -132,13 +132,9 @@ def within_a_cell(points: np.ndarray, near: np.ndarray, world_from_lattice: np.n
 
 
 def silhouette_hull(mask: np.ndarray) -> np.ndarray | None:
-    """The convex hull of a silhouette, from the centres of its pixels.
+    """The convex hull (N, 2) float64 x, y of the pixel centres of a silhouette (H, W).
 
-    Args:
-        mask: (H, W) bool, True on the object.
-
-    Returns:
-        (N, 2) float64 x, y; None where the mask is empty or touches the image border.
+    None if the mask is empty or touches the image border.
     """
     import cv2
 

@@ -41,20 +41,12 @@ class Geometry(NamedTuple):
 
 
 class Hypothesis(NamedTuple):
-    """Cameras, and a reading of the depth, to be tested.
+    """Cameras, and a reading of the depth, to be tested."""
 
-    Attributes:
-        cameras: the camera of each image, (V,).
-        depth_cameras: the camera of each depth map and of each image's sparse points; the same as ``cameras`` unless
-            only the images are out of order.
-        depth_scale: factor on the depth.
-        along_ray: whether depth is the distance from the camera centre.
-    """
-
-    cameras: Geometry
-    depth_cameras: Geometry
-    depth_scale: float = 1.0
-    along_ray: bool = False
+    cameras: Geometry  # of the V images
+    depth_cameras: Geometry  # of depth maps and sparse points; equal unless only the images are out of order
+    depth_scale: float = 1.0  # factor on the depth
+    along_ray: bool = False  # whether depth is the distance from the camera centre
 
 
 def stated_hypothesis(scene: PosedImages) -> Hypothesis:

@@ -157,14 +157,7 @@ def _blocks(count: int, views: int, device: torch.device) -> Iterator[tuple[slic
 
 
 def _render_views(
-    plan: Plan,
-    owner: list[int],
-    cameras: CameraMatrices,
-    lights: Lights,
-    out: Rendering,
-    *,
-    shadows: bool,
-    near: float,
+    plan: Plan, owner: list[int], cameras: CameraMatrices, lights: Lights, out: Rendering, *, shadows: bool, near: float
 ) -> None:
     """Render V views, view v of scene ``owner[v]``, over the background in the arrays."""
     dtype, device = out.depth.dtype, out.depth.device

@@ -78,8 +78,7 @@ class Tables(NamedTuple):
     def to(self, device: torch.device, dtype: torch.dtype) -> Tables:
         """The tables on a device, numbers in ``dtype``."""
         return Tables(
-            self.kinds,
-            *(value.to(device, dtype if value.is_floating_point() else value.dtype) for value in self[1:]),
+            self.kinds, *(value.to(device, dtype if value.is_floating_point() else value.dtype) for value in self[1:])
         )
 
 

@@ -96,13 +96,7 @@ class CameraRays:
     """
 
     def __init__(
-        self,
-        plan: Plan,
-        cameras: CameraMatrices,
-        size: tuple[int, int],
-        *,
-        near: float,
-        dtype: torch.dtype,
+        self, plan: Plan, cameras: CameraMatrices, size: tuple[int, int], *, near: float, dtype: torch.dtype
     ) -> None:
         pairs = [pair for visit in plan.visits for pair in visit.pairs()]
         self.index = {pair: place for place, pair in enumerate(pairs)}

@@ -24,11 +24,7 @@ SHAPES = {
     "delta fighter": ((0.5, 0.8), (0.3, 0.45), (0.45, 0.65), (0.045, 0.07)),
     "four engines": ((0.9, 1.4), (0.0, 0.2), (0.15, 0.24), (0.06, 0.095)),
 }
-TAILS = {
-    "rear jets": ("T",),
-    "delta fighter": ("fin", "twin fins"),
-    "low wing": ("conventional", "V", "twin fins"),
-}
+TAILS = {"rear jets": ("T",), "delta fighter": ("fin", "twin fins"), "low wing": ("conventional", "V", "twin fins")}
 
 
 def build(p: Parameters, colours: Palette) -> list[Solid]:

@@ -69,7 +69,7 @@ def _seat(p: Parameters, seat: str, colours: Palette, low: Point, high: Point) -
 def _support(
     p: Parameters, support: str, colours: Palette, top: float, x: float, side: float, width: float
 ) -> list[Solid]:
-    """What carries the seat, from y = 0 to ``top``."""
+    """The support of the seat, from y = 0 to ``top``."""
     up, material = top + 0.02, colours.trim
     if support == "four legs":
         out = p.uniform("leg_spread", 0.0, 0.12)

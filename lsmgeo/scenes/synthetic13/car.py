@@ -14,9 +14,9 @@ from lsmgeo.scenes.synthetic13.parts import Pair, bar, below, block, kept, pair,
 __all__ = ["build"]
 
 KINDS = ("sedan", "hatchback", "off-roader", "van", "pickup", "coupe", "convertible", "beetle", "racing car", "lorry")
-# Of each kind: length, width, height of the lower body, height of the cabin; where the windscreen and the rear window
-# meet the body, as shares of the length from the rear; how far their upper ends lie inside, as shares of the cabin's
-# height.
+# For each kind: length, width, height of the lower body, height of the cabin; where the windscreen and the rear
+# window meet the body, as fractions of the length from the rear; the insets of their upper ends, as fractions of the
+# cabin's height.
 SHAPES = {
     "sedan": (4.6, 1.75, 0.62, 0.52, 0.70, 0.14, 1.1, 1.0),
     "hatchback": (3.8, 1.65, 0.66, 0.62, 0.72, 0.0, 0.9, 0.35),
@@ -73,7 +73,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     side = z - 0.35 * tread
     for place in (base, -base):
         parts += pair(*wheel((place, radius, side), radius, tread, colours.dark, colours.detail))
-    # A beetle's lamps sit on its wings, which end before its nose.
+    # A beetle's lamps are on its wings, which end before its nose.
     parts += _lamps(lamps, colours, 0.88 * x if kind == "beetle" else x, z, clearance + 0.6 * belt)
     bumper = box((0, clearance + 0.12 * belt + 0.05, 0), (length + 0.12, 0.14, 1.9 * z), colours.detail)
     lean = (rake * cabin, slope * cabin)

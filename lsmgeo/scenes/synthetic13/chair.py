@@ -17,7 +17,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     """The parts of one chair, about 1 high."""
     base = p.choice("base", ("four legs", "four legs", "splayed legs", "pedestal", "star", "sled", "side panels"))
     back = p.choice("back", ("solid", "vertical slats", "horizontal slats", "round", "solid", "frame", "none"))
-    # A square stool would be a table.
+    # A square stool would look like a table.
     seat = p.choice("seat", ("square", "round", "cushioned") if back != "none" else ("round", "cushioned"))
     arms = p.choice("arms", ("none", "rails", "panels")) if back != "none" else "none"
     height = p.uniform("seat_height", 0.3, 0.75)
@@ -27,7 +27,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     thickness = p.uniform("seat_thickness", 0.04, 0.14)
     x, z, floor = depth / 2, width / 2, height - thickness
 
-    # Under a round seat the legs stand nearer the middle, or they would miss it.
+    # Under a round seat the legs are closer to the middle, so that they meet it.
     inset = 0.72 if seat == "round" else 1.0
     parts = _base(p, base, colours, floor, inset * x, inset * z)
     if seat == "round":
@@ -50,7 +50,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
 
 
 def _base(p: Parameters, base: str, colours: Palette, floor: float, x: float, z: float) -> list[Solid]:
-    """What carries the seat, from y = 0 to ``floor``."""
+    """The support of the seat, from y = 0 to ``floor``."""
     width = p.uniform("leg_width", 0.035, 0.08)
     top, ground = floor + 0.02, colours.trim
     if base in ("four legs", "splayed legs"):

@@ -79,7 +79,7 @@ def _joint(rise: float, tall: float, thick: float, colours: Palette) -> Solid:
 def _stand(
     p: Parameters, kind: str, colours: Palette, rise: float, wide: float, tall: float, thick: float
 ) -> list[Solid]:
-    """What stands on y = 0 and holds the slab, whose lower edge is at ``rise``."""
+    """The stand, on y = 0, of the slab, whose lower edge is at ``rise``."""
     usual = ("disc", "plate", "V", "arm", "easel", "bent sheet")
     stand = p.choice("stand", ("two feet", "V", "plate", "disc") if kind == "television" else usual)
     neck, reach = p.uniform("neck_width", 0.05, 0.16), p.uniform("foot_reach", 0.16, 0.3)

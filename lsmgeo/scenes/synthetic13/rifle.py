@@ -39,7 +39,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
 
 
 def _stock(p: Parameters, stock: str, colours: Palette, height: float, width: float) -> list[Solid]:
-    """What goes to the shoulder, behind x = 0."""
+    """The stock, behind x = 0."""
     if stock == "none":
         return [rod((-0.03, 0, 0), 0.01, 0.4 * height, colours.trim)]
     long, drop = p.uniform("stock_length", 0.2, 0.34), p.uniform("stock_drop", 0.01, 0.08)
@@ -89,7 +89,7 @@ def _grip(p: Parameters, stock: str, colours: Palette, height: float, width: flo
 def _fore_end(
     p: Parameters, colours: Palette, length: float, reach: float, height: float, width: float, axis: float
 ) -> list[Solid]:
-    """What the other hand holds, below or around the barrel."""
+    """The fore end, below or around the barrel."""
     form = p.choice("fore_end", ("wood", "guard", "pump", "rail"))
     long = p.uniform("fore_end_length", 0.4, 0.75) * reach
     end = length + long
@@ -138,7 +138,7 @@ def _magazine(p: Parameters, colours: Palette, length: float, height: float, wid
 def _sight(
     p: Parameters, colours: Palette, length: float, height: float, width: float, reach: float, axis: float
 ) -> list[Solid]:
-    """What one aims with, on top of the receiver."""
+    """The sight, on top of the receiver."""
     form = p.choice("sight", ("none", "scope", "scope", "irons", "red dot", "handle"))
     top = height / 2
     front = slab((length + 0.9 * reach - 0.013, axis), (length + 0.9 * reach + 0.013, axis + 0.05), 0.013, colours.dark)

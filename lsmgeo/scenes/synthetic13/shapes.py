@@ -208,9 +208,7 @@ def random_lights(generator: np.random.Generator) -> Lights:
     power = (generator.uniform(1.05, 1.3) - ambient) * shares / shares.sum()
     tint = generator.uniform(0.94, 1.0, (count + 1, 3))
     return Lights(
-        torch.from_numpy(directions),
-        torch.from_numpy(power[:, None] * tint[:-1]),
-        torch.from_numpy(ambient * tint[-1]),
+        torch.from_numpy(directions), torch.from_numpy(power[:, None] * tint[:-1]), torch.from_numpy(ambient * tint[-1])
     )
 
 

@@ -15,7 +15,7 @@ __all__ = ["build"]
 
 
 def build(p: Parameters, colours: Palette) -> list[Solid]:
-    """The parts of one sofa, in metres; one sits facing +x, its width along z."""
+    """The parts of one sofa, in metres; its front is +x, its width along z."""
     plan = p.choice("plan", ("straight", "straight", "corner left", "corner right", "daybed", "round"))
     arms = p.choice("arms", ("box", "roll", "slanted", "wing", "none")) if plan != "round" else "none"
     seats = p.count("seats", 1, 4) if plan == "straight" else p.count("seats", 2, 4)
@@ -33,10 +33,8 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
         parts = _round(p, support, colours, (lift, floor, height), rise, back, x, z)
     else:
         parts = [slab((-x, lift), (x, floor), z, colours.body)]
-        parts += [
-            _pad((-x + back - 0.02, floor - 0.02, low), (x + 0.02, height, high), colours)
-            for low, high in _pieces(-z, z, seats)
-        ]
+        for low, high in _pieces(-z, z, seats):
+            parts.append(block((-x + back - 0.02, floor - 0.02, low), (x + 0.02, height, high), colours.trim))
         if plan != "daybed":
             parts += _back(p, colours, (lift, floor, height + rise), (x, z), back, seats)
         else:
@@ -60,10 +58,6 @@ def _pieces(low: float, high: float, count: int) -> list[Pair]:
     return [(low + index * step + 0.012, low + (index + 1) * step - 0.012) for index in range(count)]
 
 
-def _pad(low: Point, high: Point, colours: Palette) -> Solid:
-    return block(low, high, colours.trim)
-
-
 def _back(p: Parameters, colours: Palette, levels: Point, half: Pair, thick: float, seats: int) -> list[Solid]:
     """The back rest along the rear edge."""
     form = p.choice("back", ("block", "cushions", "roll", "camel", "rail"))
@@ -75,11 +69,8 @@ def _back(p: Parameters, colours: Palette, levels: Point, half: Pair, thick: flo
         return [wall.rotated(2, lean / 3, pivot)]
     if form == "cushions":
         low = slab((-x, lift), (-x + 0.45 * thick, top - 0.06), z, colours.body)
-        pads = [
-            block((-x + 0.3 * thick, floor + 0.05, a), (-x + 1.2 * thick, top, b), colours.trim).rotated(2, lean, pivot)
-            for a, b in _pieces(-z, z, seats)
-        ]
-        return [low, *pads]
+        ends = (((-x + 0.3 * thick, floor + 0.05, a), (-x + 1.2 * thick, top, b)) for a, b in _pieces(-z, z, seats))
+        return [low, *(block(*corners, colours.trim).rotated(2, lean, pivot) for corners in ends)]
     if form == "roll":
         level = top - 0.5 * thick
         roll = cylinder((-x + 0.4 * thick, level, -z), (-x + 0.4 * thick, level, z), 0.55 * thick, colours.body)
@@ -88,25 +79,19 @@ def _back(p: Parameters, colours: Palette, levels: Point, half: Pair, thick: flo
         hump = ellipsoid((-x + 0.5 * thick, top - 0.12, 0), (0.5 * thick, 0.24, 0.75 * z), colours.body)
         return [slab((-x, lift), (-x + thick, top - 0.1), z, colours.body), hump]
     level = 0.6 * floor + 0.4 * top
-    rails = [
-        slab((-x, level - 0.06), (-x + 0.07, level), z, colours.detail),
-        slab((-x, top - 0.09), (-x + 0.07, top), z, colours.detail),
-    ]
-    posts = [
-        block((-x, lift, place - 0.04), (-x + 0.07, top, place + 0.04), colours.detail)
-        for place in (-z + 0.04, 0.0, z - 0.04)
-    ]
-    pads = [
-        block((-x + 0.05, floor + 0.05, a), (-x + 0.05 + 0.8 * thick, top - 0.08, b), colours.trim)
-        for a, b in _pieces(-z, z, seats)
-    ]
-    return [*rails, *posts, *pads]
+    rails = ((level - 0.06, level), (top - 0.09, top))
+    parts = [slab((-x, low), (-x + 0.07, high), z, colours.detail) for low, high in rails]
+    for place in (-z + 0.04, 0.0, z - 0.04):
+        parts.append(block((-x, lift, place - 0.04), (-x + 0.07, top, place + 0.04), colours.detail))
+    for a, b in _pieces(-z, z, seats):
+        parts.append(block((-x + 0.05, floor + 0.05, a), (-x + 0.05 + 0.8 * thick, top - 0.08, b), colours.trim))
+    return parts
 
 
 def _arms(
     p: Parameters, arms: str, plan: str, colours: Palette, levels: Pair, half: Pair, width: float, back: float
 ) -> list[Solid]:
-    """Arm rests outside the seat; on a daybed none, where a corner sofa has its chaise one."""
+    """Arm rests outside the seat: none on a daybed, one opposite the chaise of a corner sofa."""
     (lift, height), (x, z) = levels, half
     if arms == "none" or plan == "daybed":
         return []
@@ -137,7 +122,7 @@ def _arms(
 
 
 def _chaise(p: Parameters, colours: Palette, side: int, levels: Point, half: Pair, piece: float) -> list[Solid]:
-    """The long seat at one end, towards +x, with or without a back of its own."""
+    """The long seat at one end, towards +x, with or without its own back."""
     (lift, floor, height), (x, z) = levels, half
     reach, wide = p.uniform("chaise_length", 0.5, 1.3), 1.1 * piece
     out = x + reach
@@ -159,19 +144,15 @@ def _support(p: Parameters, support: str, colours: Palette, lift: float, x: floa
         return [slab((-x + 0.06, 0), (x - 0.06, lift + 0.01), z - 0.06, colours.detail)]
     near, side = x - 0.12, z - 0.1
     if support == "legs":
-        return pair(
-            *(
-                bar((s * (near + 0.03), 0, side + 0.03), (s * near, lift + 0.02, side), width, width, colours.detail)
-                for s in (-1, 1)
-            )
-        )
+        ends = (((s * (near + 0.03), 0, side + 0.03), (s * near, lift + 0.02, side)) for s in (-1, 1))
+        return pair(*(bar(foot, head, width, width, colours.detail) for foot, head in ends))
     return pair(*window((-near, 0, side - width), (near, lift + 0.05, side), 2, 0.05, colours.detail)[:4])
 
 
 def _round(
     p: Parameters, support: str, colours: Palette, levels: Point, rise: float, back: float, x: float, z: float
 ) -> list[Solid]:
-    """A sofa in the round: an oval seat in a curved back that opens to the front."""
+    """A round sofa: an oval seat in a curved back that is open at the front."""
     lift, floor, height = levels
     opening = p.uniform("opening", -0.2, 0.5) * x
     inner = max(1 - 0.9 * back / min(x, z), 0.5)
@@ -189,8 +170,6 @@ def _round(
         legs = (pillar((s * 0.55 * x, 0, 0.55 * z), lift + 0.02, size / 2, colours.detail) for s in (-1, 1))
         parts += pair(*legs)
     reach = min(0.5 * rise, 0.3)
-    pads = (
-        ellipsoid((-inner * x + 0.16, height + reach, place), (0.1, reach, 0.28 * z), colours.detail)
-        for place in spaced(-0.5 * z, 0.5 * z, 2)
-    )
-    return [*parts, *pads]
+    for place in spaced(-0.5 * z, 0.5 * z, 2):
+        parts.append(ellipsoid((-inner * x + 0.16, height + reach, place), (0.1, reach, 0.28 * z), colours.detail))
+    return parts

@@ -29,7 +29,7 @@ from lsmgeo.scenes.synthetic13.parts import (
 
 __all__ = ["build"]
 
-# Of the kinds that are boxes: height, width, depth.
+# Ranges of height, width and depth of the kinds that are boxes.
 BOXES = {
     "bookshelf": ((0.5, 0.8), (0.3, 0.5), (0.3, 0.55)),
     "tower": ((0.9, 1.4), (0.2, 0.32), (0.2, 0.45)),
@@ -120,7 +120,7 @@ def _driver(rim: str, colours: Palette, at: Point, radius: float, dish: float, p
 
 
 def _foot(p: Parameters, foot: str, colours: Palette, x: float, z: float) -> list[Solid]:
-    """What stands below y = 0."""
+    """The foot, below y = 0."""
     if foot == "none":
         return []
     drop = p.uniform("foot_height", 0.03, 0.1)

@@ -34,7 +34,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     parts += [
         part.painted(colours.detail) for part in _top(top, colours, floor - under, floor + 0.01, size * x, size * z)
     ]
-    # Legs keep under a round top.
+    # Legs stay within a round top.
     share = (1 - inset) * (1.0 if top == "rectangular" else 0.68)
     near, side = share * x - width / 2, share * z - width / 2
     parts += _base(p, base, colours, floor, near, side, width)
@@ -63,7 +63,7 @@ def _top(top: str, colours: Palette, floor: float, height: float, x: float, z: f
 def _base(
     p: Parameters, base: str, colours: Palette, floor: float, near: float, side: float, width: float
 ) -> list[Solid]:
-    """What carries the top, from y = 0 to ``floor``."""
+    """The support of the top, from y = 0 to ``floor``."""
     up, material = floor + 0.02, colours.trim
     if base in ("four legs", "splayed legs"):
         return _legs(p, base, material, up, near, side, width)
@@ -150,7 +150,7 @@ def _desk(p: Parameters, colours: Palette, floor: float, near: float, side: floa
 def _below(
     p: Parameters, base: str, colours: Palette, floor: float, near: float, side: float, width: float
 ) -> list[Solid]:
-    """What joins the legs."""
+    """The connection of the legs."""
     if base == "desk":
         return [slab((-near, floor - 0.35 * floor), (-near + 0.035, floor + 0.01), side, colours.detail)]
     form = p.choice("below", ("nothing", "apron", "shelf", "drawer", "stretcher"))

@@ -18,7 +18,7 @@ KINDS = ("candy bar", "smartphone", "flip", "slider", "desk", "rotary", "cordles
 
 
 def build(p: Parameters, colours: Palette) -> list[Solid]:
-    """The parts of one telephone, about 1 high; a mobile one stands upright with its face to +x."""
+    """The parts of one telephone, about 1 high; a mobile one is upright and faces +x."""
     kind = p.choice("kind", KINDS)
     keys = p.choice("keys", ("square", "round", "wide")) if kind not in ("smartphone", "rotary") else "none"
     if kind in ("desk", "rotary", "wall"):
@@ -162,7 +162,7 @@ def _with_handset(p: Parameters, kind: str, keys: str, colours: Palette) -> list
     body = below(slab((-x, 0), (x, high), z, colours.body), (-x, high), (x, low))
     parts = [body, slab((-x - 0.03, 0), (x + 0.03, 0.04), z + 0.03, colours.trim)]
 
-    # What lies on the slope is made for a face at x = 0 that runs up along y, and laid down.
+    # Parts on the slope are made for a face at x = 0 that extends along y, and then rotated.
     def laid(solids: list[Solid]) -> list[Solid]:
         return [part.rotated(2, 90 - slope).moved((x, low, 0)) for part in solids]
 
@@ -190,5 +190,5 @@ def _with_handset(p: Parameters, kind: str, keys: str, colours: Palette) -> list
     parts += [*laid(dial), *rest, *(part.moved((-0.6 * x, high + 0.14, 0)) for part in handset)]
     if kind == "rotary":
         return parts
-    # A wall telephone is the same thing stood up, its base to the wall.
+    # A wall telephone is the same one upright, with its base at the wall.
     return [part.rotated(2, -90) for part in parts]

@@ -38,7 +38,7 @@ def build(p: Parameters, colours: Palette) -> list[Solid]:
     beam, draught = p.uniforms(("beam", "draught"), SHAPES[kind])
     if kind == "submarine":
         return _submarine(p, colours, beam)
-    # What stands near the ends of a tug or a container ship would hang over a round hull.
+    # Parts near the ends of a tug or a container ship would overhang a round hull.
     bow = p.choice("bow", ("sharp", "round") if kind not in ("tug", "container ship") else ("sharp",))
     hull = _hull(p, bow, colours, beam, draught)
     z = beam / 2
@@ -115,7 +115,7 @@ def _rowing_boat(p: Parameters, colours: Palette, hull: list[Solid], beam: float
     """The hull is hollow, with benches across and oars."""
     wall, z = p.uniform("wall", 0.03, 0.05), beam / 2
     room = ellipsoid((-0.08, 0.02, 0), (0.36, draught - wall, z - wall), colours.body)
-    # The room takes the place of the stem's cut: three cuts a part are enough.
+    # The room replaces the stem's cut: at most three cuts per part.
     hull = [replace(part, cuts=(*part.cuts[:2], room)) for part in hull]
     count = p.count("benches", 2, 3)
     benches = [

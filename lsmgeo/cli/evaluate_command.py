@@ -41,7 +41,7 @@ def evaluate(
             iou or depth.
         shards: a folder of shards, from lsmgeo render or lsmgeo convert; by default synthetic-13.
         shapes: their number, from the categories in turn; by default all of the shards, 130 of synthetic-13, and fewer
-            where every shape is drawn (sequences 13, clouds 3) or measuring takes long (depth 26).
+            if every shape is drawn (sequences 13, clouds 3) or measuring is slow (depth 26).
         views: the largest number of views; by default as in the paper: 8, 4 for backgrounds, pose-noise and sequences,
             10 for depth, 20 for clouds.
         out: folder for the results; created if it does not exist.
@@ -53,7 +53,7 @@ def evaluate(
         orders: for order, the number of orders.
         planes: for depth and clouds, the number of planes of the plane sweep.
         split: the part of the set.
-        device: auto is a GPU where there is one.
+        device: auto is a GPU if there is one.
 
     Returns:
         The exit status.

@@ -51,23 +51,25 @@ def reconstruct(
     """Reconstruct posed images: depth maps, coloured points, a mesh, and a page with an interactive model.
 
     Args:
-        scene: posed images in any form that lsmgeo reads.
+        scene: posed images in any supported format.
         method: "sweep" is plane-sweep stereo, "hull" the visual hull of silhouettes; "v-lsm" and "d-lsm" are learnt,
             for voxels and depth maps.
-        view: number (by name, from 0) or name of an image: only this one is swept, a hull is shown from there first,
-            and it is the first input of a learnt model. By default all are swept, checked against each other and fused.
+        view: number (from 0, in the order of names) or name of an image: the only one to sweep, the one from which a
+            hull is shown first, or the first input of a learnt model. By default all are swept, checked against each
+            other and fused.
         out: folder for the results; created if it does not exist.
         neighbours: for sweeps, number of other images to match with.
-        size: longer side in pixels at which images are used.
+        size: longer side of the images in pixels, to which larger ones are reduced.
         planes: for sweeps, number of depth planes.
-        spacing: for sweeps, what is even between planes; with "disparity" a step is a pixel, which sets their number.
+        spacing: for sweeps, the quantity with even steps between planes; with "disparity" a step is one pixel, which
+            sets their number.
         near: for sweeps, nearest depth in world units; by default inferred from the scene.
         far: for sweeps, farthest depth.
-        score: for sweeps, how patches are compared.
+        score: for sweeps, the comparison of patches.
         window: for sweeps, side of the patches in pixels.
-        density: for sweeps, largest fraction of the pixels to keep; by default 0.8, or 0.4 of one view only.
-        check: for the sweep of one view, how many of its neighbours are swept too; they must agree with it. 0 takes a
-            third of the time.
+        density: for sweeps, largest fraction of the pixels to keep; by default 0.8, or 0.4 of a single view.
+        check: for the sweep of one view, the number of neighbours that are swept too and must agree with it. With 0 it
+            takes a third of the time.
         resolution: voxels along the longest side of the box of the mesh.
         rule: for hulls, whether a voxel must be within "all" silhouettes, or within three quarters of them ("mean"),
             which tolerates wrong ones.
@@ -75,7 +77,7 @@ def reconstruct(
             beside the images.
         background: for hulls and learnt models, the colour of the background, from which silhouettes are computed; it
             takes precedence. White, black, or three numbers such as 0.1,0.8,0.2.
-        memory: for sweeps, MiB that one may use.
+        memory: for sweeps, the largest memory of one sweep in MiB.
         weights: for learnt models, weights, a checkpoint or a run folder of lsmgeo train.
         views: for learnt models, the largest number of images to use, from all around.
         box: for learnt models, x,y,z,side of a cube around the object in world units; by default inferred from

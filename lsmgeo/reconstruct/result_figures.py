@@ -63,7 +63,7 @@ def summary(one: ViewResult, points: np.ndarray, colours: np.ndarray, title: str
     shown = depth.imshow(np.where(one.depth > 0, one.depth, np.nan), cmap="turbo_r", vmin=low, vmax=high)
     figure.colorbar(shown, ax=depth, location="bottom", aspect=60, label="camera z [world units]")
     shown = confidence.imshow(one.confidence.numpy(), cmap="gray", vmin=0, vmax=1)
-    words = "0 nothing known, 1 certain" if one.confidence_name == "confidence" else "1 on the object"
+    words = "0 unknown, 1 certain" if one.confidence_name == "confidence" else "1 on the object"
     figure.colorbar(shown, ax=confidence, location="bottom", aspect=60, label=words)
     _draw_cloud(cloud, one.camera, points, colours, 1 / shape)
     known = 100 * float((one.depth > 0).float().mean())

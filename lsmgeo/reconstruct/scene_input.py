@@ -88,6 +88,6 @@ def _readable(scene: PosedImages) -> tuple[PosedImages, tuple[str, ...]]:
 
 
 def first_few(reasons: list[str]) -> str:
-    """The first of the reasons, and how many there are besides."""
+    """The first of the reasons, and the number of the others."""
     more = f"; and {len(reasons) - MOST_NAMED} more" if len(reasons) > MOST_NAMED else ""
     return "; ".join(reasons[:MOST_NAMED]) + more

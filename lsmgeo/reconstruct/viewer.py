@@ -95,7 +95,7 @@ def _opaque(colours: np.ndarray) -> np.ndarray:
 def _frusta(
     used: Sequence[int], K: np.ndarray, E: np.ndarray, sizes: np.ndarray, origins: np.ndarray, rotation: np.ndarray
 ) -> Path3D:
-    """Pyramids as lines, with a roof over the upper side of the image."""
+    """Pyramids as lines, with a triangle above the top of the image."""
     from trimesh.path import Path3D
     from trimesh.path.entities import Line
 

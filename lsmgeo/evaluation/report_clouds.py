@@ -114,7 +114,7 @@ def _draw(
         rows.append([as_pixels(batch.images[0, 0], SIDE) if name == TRUTH else None, *shaded, *drawn])
     columns = ["first view"]
     columns += [f"depth, {count} views" for count in counts] + [f"points, {count} views" for count in counts]
-    return sheet(rows, methods, columns, title=f"{shape}: depth of the first view from aside; all points together")
+    return sheet(rows, methods, columns, title=f"{shape}: depth of the first view from the side; all points together")
 
 
 def _means(

@@ -1,4 +1,4 @@
-"""Depth ranges told by cameras, and found where cameras tell the wrong ones."""
+"""Depth ranges inferred from cameras, and found by sweeping where these are wrong."""
 
 import numpy as np
 import pytest
@@ -15,8 +15,8 @@ SIZE, FOCAL = (120, 160), 180.0
 EYES = np.array([[0.0, 0.0, -2.0], [0.3, 0.0, -2.0], [-0.25, 0.1, -2.0], [0.05, -0.3, -2.0]])
 
 
-def write_photographs(folder, focus):
-    """Photographs of a steep plane by cameras that look at a point, or straight ahead; and the first one's depth."""
+def write_images(folder, focus):
+    """Images of a steep plane by cameras that look at a point, or straight ahead; and the first one's depth."""
     height, width = SIZE
     v, u = np.mgrid[:height, :width].astype(float)
     K = np.array([[FOCAL, 0, width / 2 - 0.5], [0, FOCAL, height / 2 - 0.5], [0, 0, 1]])
@@ -44,7 +44,7 @@ def check_found(scene, depth):
 
 
 def test_parallel_cameras_tell_depth_by_disparity(tmp_path):
-    scene, depth = write_photographs(tmp_path, None)
+    scene, depth = write_images(tmp_path, None)
     closest = np.linalg.norm(EYES[1:] - EYES[0], axis=1).min()
     expected = [FOCAL * closest / (fraction * SIZE[1]) for fraction in (0.3, 0.01)]
     np.testing.assert_allclose(default_depth_range(scene, 0), expected)
@@ -53,7 +53,7 @@ def test_parallel_cameras_tell_depth_by_disparity(tmp_path):
 
 
 def test_what_lies_elsewhere_than_the_cameras_look_is_found(tmp_path):
-    scene, depth = write_photographs(tmp_path, (0.0, 0.0, -0.9))
+    scene, depth = write_images(tmp_path, (0.0, 0.0, -0.9))
     _, far = default_depth_range(scene, 0)
     assert far < np.median(depth)
     check_found(scene, depth)
@@ -65,15 +65,15 @@ def test_measured_points_decide(tmp_path):
     assert find_depth_range(read, 1) == default_depth_range(read, 1)
 
 
-def test_photographs_without_texture_leave_what_the_cameras_tell(tmp_path):
-    scene, _ = write_photographs(tmp_path, (0.0, 0.0, 0.0))
+def test_images_without_texture_leave_the_range_of_the_cameras(tmp_path):
+    scene, _ = write_images(tmp_path, (0.0, 0.0, 0.0))
     for path in scene.paths:
         Image.new("RGB", SIZE[::-1], (90, 90, 90)).save(path)
     assert find_depth_range(scene, 0) == default_depth_range(scene, 0)
 
 
 def test_cameras_in_one_place_tell_nothing(tmp_path):
-    scene, _ = write_photographs(tmp_path, None)
+    scene, _ = write_images(tmp_path, None)
     E = scene.cameras.cam_from_world.clone()
     E[:, :3, 3] = E[:1, :3, 3]
     same = data.PosedImages(scene.names, scene.paths, scene.cameras._replace(cam_from_world=E), None, scene.source)
@@ -82,7 +82,7 @@ def test_cameras_in_one_place_tell_nothing(tmp_path):
 
 
 def test_a_given_end_beyond_the_found_range_falls_back_on_the_cameras(tmp_path, monkeypatch):
-    scene, _ = write_photographs(tmp_path, (0.0, 0.0, 0.0))
+    scene, _ = write_images(tmp_path, (0.0, 0.0, 0.0))
     near, far = default_depth_range(scene, 0)
     monkeypatch.setattr("lsmgeo.classical.stereo.find_depth_range", lambda *_, **__: (0.1 * near, 0.2 * near))
     one = reconstruct_view(scene, 0, near=near, planes=8, size=32)

@@ -1,4 +1,4 @@
-"""Real photographs at a quarter of the work: the figures that ``python -m benchmarks classical`` prints in full.
+"""Real images at a quarter of the work: the figures that ``python -m benchmarks classical`` prints in full.
 
 The folder is named by ``LSMGEO_TEST_DATA``; the sets themselves cannot be distributed.
 """

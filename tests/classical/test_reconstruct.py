@@ -1,4 +1,4 @@
-"""Scenes known in closed form, from photographs to depth maps that agree, points and a surface."""
+"""Scenes known in closed form, from images to depth maps that agree, points and a surface."""
 
 import numpy as np
 import pytest
@@ -79,7 +79,7 @@ def test_support_counts_the_views_that_agree(whole):
 
 
 def test_a_wrong_depth_map_finds_no_support(scene, read, monkeypatch):
-    """One view's photograph is another's: what it seems to show agrees with nobody."""
+    """One view's image is another's: what it seems to show agrees with nobody."""
     honest = type(read).load
 
     def load(self, view):
@@ -111,7 +111,7 @@ def test_two_views_are_checked_against_each_other(scene, read):
         assert np.median(errors) < 2e-3
 
 
-def test_photographs_without_texture_give_nothing(scene, tmp_path):
+def test_images_without_texture_give_nothing(scene, tmp_path):
     grey = scene._replace(images=np.full_like(scene.images, 119))
     read = data.open(write_middlebury(grey, tmp_path))
     result = reconstruct_scene(read, [0, 1], **OPTIONS)

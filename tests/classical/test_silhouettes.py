@@ -1,4 +1,4 @@
-"""Silhouettes of posed photographs: alpha, files, and the rule of the background."""
+"""Silhouettes of posed images: alpha, files, and the rule of the background."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def disc(view, radius=20.0):
     return np.hypot(y - 38 - view, x - 50) < radius
 
 
-def photographs(folder, picture, *, mode="RGB", cut_out=False, views=3, lens=None):
-    """Posed photographs 0.png, 1.png, ... that ``picture(view)`` draws, (H, W, C) uint8."""
+def posed_images(folder, draw, *, mode="RGB", cut_out=False, views=3, lens=None):
+    """Posed images 0.png, 1.png, ... that ``draw(view)`` returns, (H, W, C) uint8."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = tuple(folder / f"{view}.png" for view in range(views))
     for view, path in enumerate(paths):
-        Image.fromarray(picture(view), mode).save(path)
+        Image.fromarray(draw(view), mode).save(path)
     angles = torch.linspace(0, 240, views, dtype=torch.float64)
     cameras = orbit(angles, 10.0, 2.0, focal_length=60.0, height=SIZE[0], width=SIZE[1])
     lenses = None if lens is None else (lens,) * views
@@ -36,12 +36,12 @@ def photographs(folder, picture, *, mode="RGB", cut_out=False, views=3, lens=Non
 
 
 def on_colour(colour):
-    def picture(view):
+    def draw(view):
         pixels = np.full((*SIZE, 3), colour, np.uint8)
         pixels[disc(view)] = (200, 90, 30)
         return pixels
 
-    return picture
+    return draw
 
 
 def write_masks(folder, names, mask=disc):
@@ -58,12 +58,12 @@ def check(masks, views=(0, 1, 2)):
 
 
 def test_alpha(tmp_path):
-    def picture(view):
+    def draw(view):
         alpha = np.where(disc(view), 255, 0).astype(np.uint8)
         alpha[0, :4] = (0, 127, 128, 255)
         return np.dstack((np.full((*SIZE, 3), 99, np.uint8), alpha))
 
-    scene = photographs(tmp_path, picture, mode="RGBA", cut_out=True)
+    scene = posed_images(tmp_path, draw, mode="RGBA", cut_out=True)
     for view, mask in enumerate(silhouettes(scene)):
         expected = disc(view)
         expected[0, :4] = (False, False, True, True)
@@ -71,22 +71,22 @@ def test_alpha(tmp_path):
 
 
 @pytest.mark.parametrize("place", ["masks", "../silhouettes", "derived_silhouettes"])
-def test_a_folder_beside_the_photographs_is_found(tmp_path, place):
-    scene = photographs(tmp_path / "images", on_colour(0))
+def test_a_folder_beside_the_images_is_found(tmp_path, place):
+    scene = posed_images(tmp_path / "images", on_colour(0))
     write_masks(tmp_path / "images" / place, ["0.png", "1.png", "2.png"])
     check(silhouettes(scene))
     check(silhouettes(scene, [2, 0]), (2, 0))
 
 
 def test_a_folder_may_be_named_and_names_may_have_two_endings(tmp_path):
-    scene = photographs(tmp_path / "images", on_colour(0))
+    scene = posed_images(tmp_path / "images", on_colour(0))
     write_masks(tmp_path / "elsewhere", ["0.png.png", "1.png", "2.jpg"])
     check(silhouettes(scene, folder=tmp_path / "elsewhere"))
     check(silhouettes(scene, folder=str(tmp_path / "elsewhere")))
 
 
 def test_a_transparent_pixel_of_a_mask_is_off_the_object(tmp_path):
-    scene = photographs(tmp_path / "images", on_colour(0))
+    scene = posed_images(tmp_path / "images", on_colour(0))
     (tmp_path / "masks").mkdir()
     for view in range(3):
         alpha = np.where(disc(view), 255, 0).astype(np.uint8)
@@ -95,7 +95,7 @@ def test_a_transparent_pixel_of_a_mask_is_off_the_object(tmp_path):
 
 
 def test_a_folder_that_lacks_a_mask_is_not_taken_for_one(tmp_path):
-    scene = photographs(tmp_path / "images", on_colour(0))
+    scene = posed_images(tmp_path / "images", on_colour(0))
     write_masks(tmp_path / "images" / "masks", ["0.png", "1.png"])
     with pytest.raises(OptionError, match="name a folder of masks"):
         silhouettes(scene)
@@ -109,11 +109,11 @@ def test_a_folder_that_lacks_a_mask_is_not_taken_for_one(tmp_path):
     [(0, "black"), (255, "white"), ((10, 120, 240), (10 / 255, 120 / 255, 240 / 255)), (20, "black")],
 )
 def test_the_rule_of_the_background(tmp_path, colour, background):
-    check(silhouettes(photographs(tmp_path, on_colour(colour)), background=background))
+    check(silhouettes(posed_images(tmp_path, on_colour(colour)), background=background))
 
 
 def test_by_the_rule_specks_and_pinholes_are_noise_and_holes_are_not(tmp_path):
-    def picture(view):
+    def draw(view):
         pixels = on_colour(0)(view)
         pixels[2, 2:5] = 255  # 3 of 8000 pixels, less than 0.05 %
         pixels[70:72, 80:82] = 255  # 4
@@ -121,26 +121,26 @@ def test_by_the_rule_specks_and_pinholes_are_noise_and_holes_are_not(tmp_path):
         pixels[30:34, 50] = 0
         return pixels
 
-    for view, mask in enumerate(silhouettes(photographs(tmp_path, picture), background="black")):
+    for view, mask in enumerate(silhouettes(posed_images(tmp_path, draw), background="black")):
         expected = disc(view)
         expected[70:72, 80:82] = True
         expected[30:34, 50] = False
         np.testing.assert_array_equal(mask.numpy(), expected)
 
 
-def test_masks_are_straightened_with_their_photographs(tmp_path):
+def test_masks_are_undistorted_with_their_images(tmp_path):
     K = np.array([[90.0, 0, 49.5], [0, 90, 39.5], [0, 0, 1]])
     lens = Lens("perspective", K, (-0.3, 0.05, 0.0, 0.0), *SIZE)
-    scene = photographs(tmp_path / "images", on_colour(0), lens=lens)
+    scene = posed_images(tmp_path / "images", on_colour(0), lens=lens)
     write_masks(tmp_path / "masks", ["0.png", "1.png", "2.png"])
     for view, mask in enumerate(silhouettes(scene)):
-        # Where the photograph mixes object and background, the nearest pixel may be either.
+        # Where the image mixes object and background, the nearest pixel may be either.
         assert (mask ^ (scene.load(view)[0] > 0.4)).sum() < 40
         assert (mask.numpy() ^ disc(view)).sum() > 100
 
 
 def test_bad_input_is_refused(tmp_path):
-    scene = photographs(tmp_path / "images", on_colour(0))
+    scene = posed_images(tmp_path / "images", on_colour(0))
     for options, expected in (
         ({}, "name a folder of masks"),
         ({"views": [3]}, "views must be numbers from 0 to 2"),

@@ -51,9 +51,9 @@ def test_iou_of_a_model_is_printed_and_written(weights, tmp_path, capsys):
     printed = capsys.readouterr().out
     for words in ("2 test shapes of synthetic-13", "V-LSM", "visual hull, strict", "paper, V-LSM*", "* other data"):
         assert words in printed
-    told = json.loads((tmp_path / "iou.json").read_text())
-    assert [shape["category"] for shape in told["shapes"]] == ["airplane", "bench"]
-    assert told["facts"]["models"][0]["network"] == "voxel-lsm"
+    written = json.loads((tmp_path / "iou.json").read_text())
+    assert [shape["category"] for shape in written["shapes"]] == ["airplane", "bench"]
+    assert written["facts"]["models"][0]["network"] == "voxel-lsm"
 
 
 def test_depth_of_a_model_is_printed_and_written(weights, tmp_path, capsys):

@@ -90,11 +90,11 @@ def test_all_views_are_swept_and_the_results_are_a_scene_again(scene, tmp_path, 
     out = tmp_path / "out"
     assert cli.main(["reconstruct", str(folder), "--out", str(out), "--resolution", "64"]) == 0
     depths, entries = read_results(out)
-    photographs = [entry["photograph"] for entry in entries]
-    assert sorted(photographs) == sorted(odd.names)
+    images = [entry["photograph"] for entry in entries]
+    assert sorted(images) == sorted(odd.names)
     assert len({Path(entry["file"]).name.lower() for entry in entries}) == 5
-    for depth, photograph in zip(depths, photographs, strict=True):
-        check_depth(depth, scene.depth[odd.names.index(photograph)])
+    for depth, image in zip(depths, images, strict=True):
+        check_depth(depth, scene.depth[odd.names.index(image)])
     assert "&lt;b&gt;&amp;.png" in (out / "report.html").read_text()
     capsys.readouterr()
     # What is written agrees with itself where info measures it: depth of one view in another.
@@ -173,7 +173,7 @@ def test_a_scene_without_silhouettes_has_no_hull_and_says_what_to_name(folder, t
     assert not (tmp_path / "out").exists()
 
 
-def test_photographs_without_texture_give_a_warning_and_status_1(scene, tmp_path, capsys):
+def test_images_without_texture_give_a_warning_and_status_1(scene, tmp_path, capsys):
     flat = scene._replace(images=np.full_like(scene.images, 90))
     out = tmp_path / "out"
     out.mkdir()
@@ -187,7 +187,7 @@ def test_photographs_without_texture_give_a_warning_and_status_1(scene, tmp_path
         assert not (out / name).exists()
 
 
-def test_a_damaged_photograph_is_left_out_and_named(scene, tmp_path, capsys):
+def test_a_damaged_image_is_left_out_and_named(scene, tmp_path, capsys):
     folder, out = write_middlebury(scene, tmp_path / "scene"), tmp_path / "out"
     content = (folder / "v1.png").read_bytes()
     (folder / "v1.png").write_bytes(content[: len(content) // 2])
@@ -204,7 +204,7 @@ def test_a_damaged_photograph_is_left_out_and_named(scene, tmp_path, capsys):
     assert "v1.png" in capsys.readouterr().err
 
 
-def test_results_never_replace_the_photographs(scene, tmp_path, capsys):
+def test_results_never_replace_the_images(scene, tmp_path, capsys):
     folder = write_colmap(scene, tmp_path / "scene", form="text")
     before = {path: path.read_bytes() for path in folder.rglob("*.png")}
     assert cli.main(["reconstruct", str(folder), "--out", str(folder)]) == 2
@@ -299,7 +299,7 @@ def test_views_of_which_one_end_of_the_range_leaves_nothing_are_left_out(scene, 
     assert len(list((out / "depth").iterdir())) == 4
 
 
-def test_two_photographs_are_enough(scene, tmp_path):
+def test_two_images_are_enough(scene, tmp_path):
     file = write_middlebury(scene, tmp_path) / "scene_par.txt"
     lines = file.read_text().splitlines()
     file.write_text("\n".join(["2", *lines[1:3]]))
@@ -307,7 +307,7 @@ def test_two_photographs_are_enough(scene, tmp_path):
     check_depth(read_results(tmp_path / "out")[0][0], scene.depth[0])
 
 
-def test_one_photograph_is_too_few(scene, tmp_path, capsys):
+def test_one_image_is_too_few(scene, tmp_path, capsys):
     file = write_middlebury(scene, tmp_path) / "scene_par.txt"
     lines = file.read_text().splitlines()
     file.write_text("\n".join(["1", *lines[1:2]]))
@@ -360,8 +360,8 @@ def test_cameras_of_the_originals_give_what_resized_ones_give(scene, tmp_path):
 
 
 @pytest.mark.parametrize("folder_size", [(144, 192), (108, 72)])
-def test_photographs_of_several_sizes_are_matched(scene, tmp_path, folder_size):
-    """Some of the photographs are stored at another size, with the cameras that belong to it."""
+def test_images_of_several_sizes_are_matched(scene, tmp_path, folder_size):
+    """Some of the images are stored at another size, with the cameras that belong to it."""
     height, width = folder_size
     read = data.open(write_middlebury(scene, tmp_path))
     lines = (tmp_path / "scene_par.txt").read_text().splitlines()

@@ -280,9 +280,9 @@ def test_fewer_views_than_wanted_are_told():
 def test_a_report_is_written_whole(tmp_path):
     report = evaluate([Method("fake", FakeVoxels(by_count))], slabs(), "iou", Options(views=2))
     assert sorted(path.name for path in write_report(report, tmp_path / "new")) == ["iou.csv", "iou.json", "iou.png"]
-    told = json.loads((tmp_path / "new" / "iou.json").read_text())
-    assert told["facts"]["data"] == "slabs"
-    row = next(row for row in told["tables"][0]["rows"] if row["name"] == "fake")
+    written = json.loads((tmp_path / "new" / "iou.json").read_text())
+    assert written["facts"]["data"] == "slabs"
+    row = next(row for row in written["tables"][0]["rows"] if row["name"] == "fake")
     np.testing.assert_allclose(row["values"], values(report, "views", "fake"), atol=1e-8)
     lines = list(csv.DictReader(io.StringIO((tmp_path / "new" / "iou.csv").read_text())))
     line = next(line for line in lines if line["row"] == "fake" and line["table"] == "views" and line["column"] == "2")

@@ -14,13 +14,13 @@ from lsmgeo.evaluation.report import Scores, means_of, standard_error
 def test_the_standard_error_is_the_spread_of_repeated_draws():
     generator = np.random.default_rng(0)
     names = ["a"] * 4 + ["b"] * 9
-    means, told = [], []
+    means, estimates = [], []
     for _ in range(3000):
         values = np.r_[generator.normal(1.0, 0.5, 4), generator.normal(3.0, 0.1, 9)]
         means.append((values[:4].mean() + values[4:].mean()) / 2)
-        told.append(standard_error(values.tolist(), names) ** 2)
-    np.testing.assert_allclose(np.mean(told), np.var(means), rtol=0.06)
-    np.testing.assert_allclose(np.mean(told), (0.5**2 / 4 + 0.1**2 / 9) / 4, rtol=0.06)
+        estimates.append(standard_error(values.tolist(), names) ** 2)
+    np.testing.assert_allclose(np.mean(estimates), np.var(means), rtol=0.06)
+    np.testing.assert_allclose(np.mean(estimates), (0.5**2 / 4 + 0.1**2 / 9) / 4, rtol=0.06)
 
 
 def test_what_is_missing_counts_nowhere():
@@ -45,7 +45,7 @@ def test_nothing_that_json_has_not_is_written(tmp_path):
     table = Table("t", "title", ["x", "y"], [Row("r", [Cell(math.nan), None]), Row("s", [Cell(1.5, 0.25), Cell(2.0)])])
     report = Report("bare", [table], {}, [{"value": math.inf, "many": [math.nan, 1.0]}])
     write_report(report, tmp_path)
-    told = json.loads((tmp_path / "bare.json").read_text(), parse_constant=lambda name: pytest.fail(name))
-    assert told["tables"][0]["rows"][0]["values"] == [None, None]
-    assert told["shapes"] == [{"value": None, "many": [None, 1.0]}]
+    written = json.loads((tmp_path / "bare.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+    assert written["tables"][0]["rows"][0]["values"] == [None, None]
+    assert written["shapes"] == [{"value": None, "many": [None, 1.0]}]
     assert format_table(table).splitlines()[1:] == ["r              -    -", "s      1.5 ± 0.2  2.0"]

@@ -1,4 +1,4 @@
-"""Drawing primitives: figures as PNG, images in rows, voxels shaded by NumPy alone, depth and points."""
+"""Drawing primitives: figures as PNG, rows of images, and voxels, depth and points drawn with NumPy."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 __all__ = ["Pixels", "as_pixels", "as_png", "draw_depth", "draw_points", "draw_voxels", "new_figure", "tile"]
 
 COLOUR = (0.42, 0.60, 0.84)
-# Where light comes from, in the viewer's axes (x right, y down, z forward): the left, above, and behind; of length 1.
+# The direction to the light in the viewer's axes (x right, y down, z forward): left, above and behind; of length 1.
 LIGHT = np.array([-0.3, -0.7, -0.648])
 AMBIENT = 0.4
-# Pixels of a side that one drawn pixel is the mean of.
+# Supersampling along each side of a pixel.
 FINER = 2
-# Half the side of what is seen of the unit cube's world.
+# Half the side of the visible square, world units, for the unit cube.
 REACH = 0.56
-# Dots along the side of a quad; only ones much larger than the image would need more.
+# The largest number of dots along the side of a quad.
 MOST_DOTS = 1 << 10
-# Between neighbouring pixels whose points are farther apart than this many of their widths there is no surface.
+# Neighbouring pixels whose points are farther apart than this many pixel widths are not connected.
 STEEPEST = 10.0
 
 Floats = npt.NDArray[np.float64]
@@ -38,7 +38,7 @@ Pixels = npt.NDArray[np.uint8]
 
 
 def new_figure(width: float, height: float, title: str = "", *, dpi: int = 100, layout: str = "constrained") -> Figure:
-    """A matplotlib figure of so many inches that needs no window."""
+    """A matplotlib figure, sizes in inches, without a window."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), dpi=dpi, layout=layout)  # type: ignore[arg-type]
@@ -55,7 +55,7 @@ def as_png(figure: Figure) -> bytes:
 
 
 def as_pixels(image: Tensor, side: int | None = None) -> Pixels:
-    """An image (3, h, w) in [0, 1] as (h, w, 3) uint8, or as a square of that side."""
+    """An image (3, h, w) in [0, 1] as (h, w, 3) uint8, or resized to a square."""
     image = image.detach().float().cpu()
     if side is not None:
         image = torch.nn.functional.interpolate(image[None], (side, side), mode="bilinear", antialias=True)[0]
@@ -63,11 +63,11 @@ def as_pixels(image: Tensor, side: int | None = None) -> Pixels:
 
 
 def tile(images: Sequence[Sequence[Pixels | None]], gap: int = 4) -> Pixels:
-    """Rows of images of one size as one, white between them and in the place of those that are None.
+    """Rows of images of one size as one image, with white gaps and white for None.
 
     Args:
         images: rows, which may differ in length.
-        gap: pixels between two.
+        gap: between two images, in pixels.
 
     Returns:
         (h, w, 3) uint8.
@@ -92,26 +92,26 @@ def draw_voxels(
     colour: Sequence[float] = COLOUR,
     reach: float = REACH,
 ) -> Pixels:
-    """Draw the faces of occupied voxels as seen from far away.
+    """Draw the faces of occupied voxels in orthographic projection.
 
-    They are shaded by a light at the viewer's left, and darker where voxels stand around them.
+    They are shaded by a light from the viewer's left, and darker where other voxels surround them.
 
     Convention:
         The grid fills [-0.5, 0.5]^3 of the world, y up; azimuth and elevation as in `lsmgeo.cameras.orbit`.
 
     Args:
         occupancy: (D, H, W) bool.
-        azimuth: degrees, from where it is seen.
+        azimuth: of the viewer, degrees.
         elevation: degrees in (-90, 90).
         size: height and width of the image in pixels.
         colour: of the voxels, RGB in [0, 1].
-        reach: half the side of what is seen, world units.
+        reach: half the side of the visible square, world units.
 
     Returns:
         (size, size, 3) uint8 RGB on white.
 
     Raises:
-        ShapeError: the grid is no (D, H, W).
+        ShapeError: the grid is not (D, H, W).
         DTypeError: it is not bool.
 
     Example:
@@ -140,24 +140,24 @@ def draw_depth(
     size: int = 192,
     reach: float = REACH,
 ) -> Pixels:
-    """Draw a depth map as the shaded surface that it is, from a viewpoint beside its camera's.
+    """Draw a depth map as a shaded surface, from a viewpoint beside its camera's.
 
-    Between pixels of one surface it is filled, over jumps of depth it is torn. Shading shows errors that colours by
-    depth hide (Kar et al. 2017, figure 4: "visualized with shading from a shifted viewpoint").
+    The surface is cut at depth discontinuities. Shading shows errors that colours by depth hide (Kar et al. 2017,
+    figure 4: "visualized with shading from a shifted viewpoint").
 
     Args:
-        depth: (h, w) camera z, 0 where there is none.
+        depth: (h, w) camera z, 0 for no depth.
         camera: one camera, of any image size.
-        turn: degrees by which the viewer goes round the world's origin, to the camera's right.
-        lift: degrees by which they rise.
+        turn: azimuth of the viewer about the world's origin relative to the camera, degrees, positive to its right.
+        lift: elevation relative to the camera, degrees.
         size: height and width of the image in pixels.
-        reach: half the side of what is seen about the world's origin, world units.
+        reach: half the side of the visible square about the world's origin, world units.
 
     Returns:
         (size, size, 3) uint8 RGB on white.
 
     Raises:
-        ShapeError, DTypeError: the depth is no floating (h, w).
+        ShapeError, DTypeError: the depth is not a floating tensor (h, w).
     """
     from scipy.spatial.transform import Rotation
 
@@ -168,8 +168,7 @@ def draw_depth(
     camera = as_tensors(camera, "draw_depth")
     z = depth.detach().double().cpu().numpy()
     known = np.isfinite(z) & (z > 0)
-    # At depth 1 where there is none.
-    filled = torch.from_numpy(np.where(known, z, 1.0)).to(camera.device)
+    filled = torch.from_numpy(np.where(known, z, 1.0)).to(camera.device)  # depth 1 for no depth
     points = unproject_depth(camera.at(None), filled[None, None])[0, 0].cpu().numpy()
     pixel = float(np.median(z[known]) if known.any() else 1.0) / float(resize(camera, *depth.shape).intrinsics[0, 0])
     ends = [(rows, columns) for rows in (slice(-1), slice(1, None)) for columns in (slice(-1), slice(1, None))]
@@ -196,7 +195,7 @@ def draw_points(
     dot: float = 1.5,
     reach: float = REACH,
 ) -> Pixels:
-    """Draw coloured points of the world as small squares, near ones over far ones, as seen from far away.
+    """Draw coloured points as small squares, near ones over far ones, in orthographic projection.
 
     Args:
         points: (N, 3).
@@ -205,7 +204,7 @@ def draw_points(
         elevation: degrees in (-90, 90).
         size: height and width of the image in pixels.
         dot: side of a point in pixels.
-        reach: half the side of what is seen, world units.
+        reach: half the side of the visible square, world units.
 
     Returns:
         (size, size, 3) uint8 RGB on white.
@@ -218,21 +217,21 @@ def draw_points(
 
 
 def _viewer(azimuth: float, elevation: float) -> Floats:
-    """The rows of the rotation of a viewer on a sphere about the origin."""
+    """The world-to-camera rotation of a viewer on a sphere about the origin."""
     around = torch.tensor(azimuth, dtype=torch.float64)
     return np.asarray(orbit(around, elevation, 2.0, focal_length=1.0, height=1, width=1).cam_from_world[:3, :3])
 
 
 def _visible_faces(grid: np.ndarray, view: Floats) -> tuple[Floats, Floats]:
-    """The faces (Q, 4, 3) of occupied voxels, indexed x, y, z, on the viewer's side, and how bright each is (Q,)."""
+    """The faces (Q, 4, 3) of occupied voxels, indexed x, y, z, towards the viewer, and the brightness (Q,) of each."""
     padded = np.pad(grid, 3)
-    crowded = padded.astype(np.float64)  # how full 5 x 5 x 5 voxels are
+    crowded = padded.astype(np.float64)  # the occupied fraction of 5 x 5 x 5 voxels
     for axis in range(3):
         crowded = np.mean([np.roll(crowded, step, axis) for step in range(-2, 3)], axis=0)
     quads, shades = [], []
     for axis in range(3):
         if abs(view[2, axis]) < 1e-9:
-            continue  # on edge
+            continue  # edge-on
         side = -1 if view[2, axis] > 0 else 1
         others = [other for other in range(3) if other != axis]
         voxel = np.argwhere(grid & ~np.roll(padded, -side, axis)[3:-3, 3:-3, 3:-3])
@@ -248,7 +247,7 @@ def _visible_faces(grid: np.ndarray, view: Floats) -> tuple[Floats, Floats]:
 
 
 def _splat(quads: Floats, colours: Floats, view: Floats, size: int, reach: float) -> Pixels:
-    """Draw quads (Q, 4, 3) of one colour each, near over far, as seen from far away."""
+    """Draw quads (Q, 4, 3) of one colour each, near over far, in orthographic projection."""
     fine = check_whole("draw", "size", size, 1, 4096) * FINER
     image = np.ones((fine * fine, 3))
     if len(quads):
@@ -264,7 +263,7 @@ def _splat(quads: Floats, colours: Floats, view: Floats, size: int, reach: float
 
 
 def _dots(quads: Floats, scale: float) -> tuple[Floats, npt.NDArray[np.int64]]:
-    """Dots (N, 3) so dense that nothing shows between them at so many pixels a unit, and the quad (N,) of each."""
+    """Dots (N, 3) that cover quads without gaps at ``scale`` pixels a unit, and the quad (N,) of each."""
     widest = np.linalg.norm(quads - np.roll(quads, 1, 1), axis=-1).max(-1)
     levels = np.ceil(np.clip(1.2 * scale * widest, 2, MOST_DOTS)).astype(np.int64)
     dots, owner = [], []

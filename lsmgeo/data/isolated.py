@@ -27,9 +27,9 @@ __all__ = ["parse_isolated"]
 
 Arrays = dict[str, np.ndarray]
 
-MOST_ANSWERED = 1 << 30
-MOST_ASKED = 1 << 26
-MOST_NAMES = 1 << 20
+MAX_ANSWER_BYTES = 1 << 30
+MAX_REQUEST_BYTES = 1 << 26
+MAX_LINE_BYTES = 1 << 20
 
 
 def parse_isolated(
@@ -68,7 +68,7 @@ def parse_isolated(
         # The files of one process are held in memory at once: up to 64 MiB together.
         files, held = [], 0
         for number, path in waiting:
-            if held > MOST_ASKED:
+            if held > MAX_REQUEST_BYTES:
                 break
             try:
                 content = read_bytes(path, limit)
@@ -77,13 +77,13 @@ def parse_isolated(
                 continue
             files.append((number, path, content))
             held += len(content)
-        found = _ask(function, [file[1:] for file in files], arguments, memory, seconds) if files else []
+        found = _run_process(function, [file[1:] for file in files], arguments, memory, seconds) if files else []
         answers |= {file[0]: answer for file, answer in zip(files, found, strict=False)}
         waiting = [one for one in waiting if one[0] not in answers]
     return [answers[number] for number in range(len(paths))]
 
 
-def _ask(
+def _run_process(
     function: Callable[..., object], files: Sequence[tuple[Path, bytes]], arguments: object, memory: int, seconds: float
 ) -> list[Arrays | DataError]:
     """The answers up to the first file that ends the process, at least one."""
@@ -116,7 +116,7 @@ def _ask(
         answers: list[Arrays | DataError] = []
         for path, _ in files:
             try:
-                found = _received(output, reason)
+                found = _read_answer(output, reason)
             # The process is as untrusted as the file, and NumPy raises many kinds of errors on damaged arrays.
             except Exception:
                 return [*answers, DataError(path, "made its parser return an invalid answer")]
@@ -129,9 +129,9 @@ def _ask(
     return answers
 
 
-def _received(stream: BinaryIO, reason: str) -> Arrays | str:
+def _read_answer(stream: BinaryIO, reason: str) -> Arrays | str:
     """The next answer: arrays, or the reason why there are none, which is ``reason`` if the process ended."""
-    line = stream.readline(MOST_NAMES)
+    line = stream.readline(MAX_LINE_BYTES)
     if not line.endswith(b"\n"):
         return reason
     answer = json.loads(line)
@@ -152,7 +152,7 @@ def _reason(code: int, seconds: float) -> str:
     return f"took its parser more than {seconds:g} seconds" if name == "SIGALRM" else f"crashed its parser ({name})"
 
 
-def _next() -> bytes | None:
+def _next_part() -> bytes | None:
     """The next part of standard input, None at its end."""
     header = sys.stdin.buffer.read(8)
     return sys.stdin.buffer.read(int.from_bytes(header, "little")) if header else None
@@ -160,11 +160,11 @@ def _next() -> bytes | None:
 
 def _serve() -> None:
     """The process: read the request from standard input, then answer for each file."""
-    memory, seconds, source, name, arguments = json.loads(_next() or b"")
+    memory, seconds, source, name, arguments = json.loads(_next_part() or b"")
     with contextlib.suppress(ImportError):
         import resource
 
-        for limit, most in (("AS", memory), ("FSIZE", MOST_ANSWERED), ("CORE", 0)):
+        for limit, most in (("AS", memory), ("FSIZE", MAX_ANSWER_BYTES), ("CORE", 0)):
             kind = getattr(resource, f"RLIMIT_{limit}")
             hard = resource.getrlimit(kind)[1]
             most = most if hard == resource.RLIM_INFINITY else min(most, hard)
@@ -173,7 +173,7 @@ def _serve() -> None:
     output, sys.stdout = sys.stdout.buffer, sys.stderr  # text that a library prints is not an answer
     function = runpy.run_path(source)[name]
     alarm = getattr(signal, "setitimer", None)
-    while (content := _next()) is not None:
+    while (content := _next_part()) is not None:
         if alarm is not None:  # SIGALRM ends the process
             alarm(signal.ITIMER_REAL, seconds)
         answer = io.BytesIO()

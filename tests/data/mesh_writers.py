@@ -36,7 +36,7 @@ def mtl(names: Sequence[str]) -> bytes:
 
 
 def ply(form: str, *, triangles: bool = False, tinted: str = "face", mixed: bool = False) -> bytes:
-    """The cube, with an element that no reader wants before the faces, its lists of differing length if wanted.
+    """The cube, with an element before the faces that no reader needs, with lists of different lengths if ``mixed``.
 
     Colours are at "face" or "vertex".
     """

@@ -134,7 +134,7 @@ def test_what_an_object_must_have(tree, tmp_path, lost, match):
 
 
 def test_an_empty_tree_and_strange_names(tree, tmp_path):
-    with pytest.raises(DataError, match="no folder"):
+    with pytest.raises(DataError, match="not a folder"):
         data.convert_set(tmp_path / "nowhere", tmp_path / "set", jobs=1)
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match="holds no renders"):
@@ -145,7 +145,7 @@ def test_an_empty_tree_and_strange_names(tree, tmp_path):
         data.convert_set(tree, tmp_path / "set", jobs=1, shapes=0)
     assert data.convert_set(tree, tmp_path / "set", jobs=1, shapes=1).shapes == 1
     (tree / "renders" / CHAIR / "a b").mkdir()
-    with pytest.raises(DataError, match="whose name is none"):
+    with pytest.raises(DataError, match="an object with an invalid name"):
         data.convert_set(tree, tmp_path / "other", jobs=1)
     shutil.rmtree(tree / "renders" / CHAIR)
     shutil.rmtree(tree / "voxels")
@@ -200,11 +200,11 @@ def test_the_command(written, tmp_path, capsys):
         ('{"a": {"other": []}}', "must be a synset"),
         ('{"a": {"train": "b"}}', "must be a list"),
         ('{"a": {"train": {"b": 1}}}', "must be a list"),
-        ('{"a": {"train": ["../../etc"]}}', "no model's identifier"),
-        ('{"a": {"train": ["b\\u0000"]}}', "no model's identifier"),
-        ('{"a": {"train": [1]}}', "no model's identifier"),
+        ('{"a": {"train": ["../../etc"]}}', "not an identifier of a model"),
+        ('{"a": {"train": ["b\\u0000"]}}', "not an identifier of a model"),
+        ('{"a": {"train": [1]}}', "not an identifier of a model"),
         ('{"a": {"train": [NaN]}}', "is not JSON"),
-        ('{"a": {"train": ["' + "b" * 129 + '"]}}', "no model's identifier"),
+        ('{"a": {"train": ["' + "b" * 129 + '"]}}', "not an identifier of a model"),
         ('{"a": {"train": ["b"], "test": ["b"]}}', "in two parts"),
         ('{"a": {}, "a": {}}', "twice"),
         (" " * (1 << 25), "larger than the limit"),

@@ -193,10 +193,10 @@ TARS = {
     "a size beyond the file": (header("00000000.json", 2**20), "announces 1048576 bytes"),
     "a size of another coding": (header("00000000.json", 2**33), "damaged tar header at byte 0"),
     "a negative size": (header("00000000.json", -1), "damaged tar header at byte 0"),
-    "a path": (header("../00000000.json", 0) + END, "no member of a shape"),
-    "a path from the root": (header("/00000000.json", 0) + END, "no member of a shape"),
-    "a name with a path in it": (header("00000000./../json", 0) + END, "no member of a shape"),
-    "another file": (header("readme.txt", 0) + END, "no member of a shape"),
+    "a path": (header("../00000000.json", 0) + END, "not a member of a shape"),
+    "a path from the root": (header("/00000000.json", 0) + END, "not a member of a shape"),
+    "a name with a path in it": (header("00000000./../json", 0) + END, "not a member of a shape"),
+    "another file": (header("readme.txt", 0) + END, "not a member of a shape"),
     "a link": (header("00000000.json", 0, tarfile.SYMTYPE, "/etc/passwd"), "something else than regular files"),
     "a hard link": (header("00000000.json", 0, tarfile.LNKTYPE, "00000000.00.png"), "something else"),
     "a device": (header("00000000.json", 0, tarfile.CHRTYPE), "something else than regular files"),
@@ -207,7 +207,7 @@ TARS = {
     "no json": (header("00000000.00.png", 0) + END, "holds no 00000000.json"),
     "a member twice": (2 * header("00000000.00.png", 0) + END, "holds 00000000.00.png twice"),
     "no end": (header("00000000.00.png", 2) + block(b"{}"), "damaged tar header at byte 1024"),
-    "a path in two parts": (parted("folder", "00000000.json") + END, "no member of a shape"),
+    "a path in two parts": (parted("folder", "00000000.json") + END, "not a member of a shape"),
     "an empty json": (header("00000000.json", 0) + bytes(1024), "is not JSON"),
 }
 

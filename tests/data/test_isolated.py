@@ -121,7 +121,7 @@ def test_many_threads_may_have_processes(tmp_path):
 
 
 def test_files_that_are_large_together_are_held_in_turn(tmp_path, monkeypatch):
-    monkeypatch.setattr("lsmgeo.data.isolated.MOST_ASKED", 3)
+    monkeypatch.setattr("lsmgeo.data.isolated.MAX_REQUEST_BYTES", 3)
     answers = run(
         tmp_path, "return {'a': np.array(len(content))}", [b"12", b"1234", bytes(101), b"", b"123"], limit=100
     )

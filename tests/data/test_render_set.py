@@ -253,7 +253,7 @@ def test_splits_by_name_have_their_shares():
         ({"source": "synthetic-13", "shapes": 0}, OptionError, "shapes must be a whole number"),
         ({"source": "synthetic-13", "shapes": 1.5}, OptionError, "shapes must be a whole number"),
         ({"source": "synthetic-13", "shapes": 3, "jobs": 0}, OptionError, "jobs must be at least 1"),
-        ({"source": "nowhere", "shapes": 3}, DataError, "no folder of meshes"),
+        ({"source": "nowhere", "shapes": 3}, DataError, "neither a folder of meshes"),
         ({"source": ".", "shapes": 3}, DataError, "holds no mesh"),
         ({"source": "synthetic-13", "shapes": 3, "recipe": Recipe(views=0)}, OptionError, "views must be"),
         ({"source": "synthetic-13", "shapes": 3, "recipe": Recipe(size=5000)}, OptionError, "size must be"),
@@ -276,7 +276,7 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
 
 
 def test_long_work_tells_a_log_how_far_it_is(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(progress_of, "SECONDS_BETWEEN_LOOKS", 0.01)
+    monkeypatch.setattr(progress_of, "SECONDS_BETWEEN_UPDATES", 0.01)
     monkeypatch.setattr(progress_of, "SECONDS_BETWEEN_LINES", 0.02)
     render_set("synthetic-13", tmp_path, RECIPE, shapes=30, per_shard=30, jobs=1, progress=True)
     told = [int(line.split(" of 60 views")[0]) for line in capsys.readouterr().err.splitlines() if " of 60" in line]

@@ -12,8 +12,7 @@ import numpy as np
 from lsmgeo._checks import describe
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.data.formats.depth_files import DepthPng
-from lsmgeo.data.formats.scene_assembly import assemble, check_camera, check_image_size, check_last_row, make_cameras
-from lsmgeo.data.images import has_alpha, image_size
+from lsmgeo.data.formats.scene_assembly import SceneBuilder, any_alpha, check_last_row
 from lsmgeo.data.json_files import read_array, read_json, read_number, read_string, sniff_json
 from lsmgeo.data.posed_images import PosedImages
 from lsmgeo.data.read_files import file_reader, path_inside
@@ -96,22 +95,16 @@ def read_cameras_json(path: str | Path) -> PosedImages:
     if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_CAMERAS:
         raise DataError(file, f"cameras must be a list of 1 to {MOST_CAMERAS} cameras; got {describe(entries)}")
 
-    names, paths, sizes, depths = [], [], [], []
-    intrinsics, poses = np.zeros((len(entries), 3, 3)), np.zeros((len(entries), 3, 4))
+    builder = SceneBuilder("cameras", file, pixel_center=center)
     for view, entry in enumerate(entries):
         where = f"camera {view}"
         if not isinstance(entry, dict):
             raise DataError(file, f"{where}: expected an object; got {describe(entry)}")
-        names.append(read_string(entry, "file" if "file" in entry else "name", file, where))
-        paths.append(path_inside(file.parent, names[-1], file))
-        sizes.append(image_size(paths[-1]))
-        check_image_size(_size(entry, file, where), sizes[-1], paths[-1], file, where)
-        intrinsics[view] = read_array(entry, "K", (3, 3), file, where)
-        poses[view] = _pose(entry, file, where)
-        check_camera(intrinsics[view], poses[view, :, :3], file, where)
-        depths.append(_depth(entry, file, where))
-    cameras = make_cameras(intrinsics, poses[:, :, :3], poses[:, :, 3], sizes, file, pixel_center=center)
-    return assemble(names, paths, cameras, "cameras", file=file, depths=depths, cut_out=any(map(has_alpha, paths)))
+        name = read_string(entry, "file" if "file" in entry else "name", file, where)
+        K, pose = read_array(entry, "K", (3, 3), file, where), _pose(entry, file, where)
+        path, size, depth = path_inside(file.parent, name, file), _size(entry, file, where), _depth(entry, file, where)
+        builder.add(name, path, K, pose[:, :3], pose[:, 3], where, size=size, depth=depth)
+    return builder.scene(cut_out=any_alpha(builder.paths))
 
 
 def _depth(entry: dict[str, Any], file: Path, where: str) -> DepthPng | None:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lsmgeo.data.formats.scene_assembly import MAX_PARAMETER, MAX_SIDE, assemble, check_rotation, make_cameras
-from lsmgeo.data.images import SUFFIXES, has_alpha, image_size
+from lsmgeo.data.formats.scene_assembly import MAX_PARAMETER, MAX_SIDE, SceneBuilder, any_alpha
+from lsmgeo.data.images import SUFFIXES, image_size
 from lsmgeo.data.posed_images import PosedImages
 from lsmgeo.data.read_files import file_reader, path_inside
 from lsmgeo.errors import DataError
@@ -72,18 +72,13 @@ def read_llff(path: str | Path) -> PosedImages:
 
     matrices = rows[:, :15].reshape(-1, 3, 5)
     down, right, back = (matrices[:, :, column] for column in range(3))
-    world_from_cam = np.stack((right, down, -back), -1)
-    intrinsics, sizes = np.zeros((len(rows), 3, 3)), []
-    for view, image in enumerate(paths):
-        where = f"row {view}"
-        check_rotation(world_from_cam[view], file, where)
-        sizes.append(image_size(image))
-        intrinsics[view] = _intrinsics(matrices[view, :, 4], sizes[-1], file, f"{where} ({image.name!r})")
-    R = world_from_cam.transpose(0, 2, 1)
+    R = np.stack((right, down, -back), -1).transpose(0, 2, 1)
     t = -(R @ matrices[:, :, 3:4])[..., 0]
-    cameras = make_cameras(intrinsics, R, t, sizes, file, pixel_center="half")
-    names = [image.name for image in paths]
-    return assemble(names, paths, cameras, "llff", file=file, cut_out=any(map(has_alpha, paths)))
+    builder = SceneBuilder("llff", file, pixel_center="half")
+    for view, path in enumerate(paths):
+        K = _intrinsics(matrices[view, :, 4], image_size(path), file, f"row {view} ({path.name!r})")
+        builder.add(path.name, path, K, R[view], t[view], f"row {view}")
+    return builder.scene(cut_out=any_alpha(paths))
 
 
 def _read_array(file: Path) -> np.ndarray:

@@ -14,9 +14,8 @@ import torch
 from lsmgeo._checks import check_choice
 from lsmgeo.data.formats.depth_files import DepthPng
 from lsmgeo.data.formats.mat_files import parse_mat
-from lsmgeo.data.formats.scene_assembly import assemble, check_camera, check_last_row, make_cameras
+from lsmgeo.data.formats.scene_assembly import SceneBuilder, check_last_row
 from lsmgeo.data.formats.synsets import synset_category
-from lsmgeo.data.images import image_size
 from lsmgeo.data.isolated import parse_isolated
 from lsmgeo.data.posed_images import PosedImages, Voxels
 from lsmgeo.data.read_files import file_reader, path_inside
@@ -119,32 +118,26 @@ def read_mat_files(paths: Sequence[Path]) -> list[Arrays | DataError]:
 
 
 def _scene(folder: Path, views: Sequence[int], cameras: Sequence[tuple[Path, Arrays]]) -> PosedImages:
-    K, E, sizes, depths = [], [], [], []
-    paths = [path_inside(folder, f"render_{view}.png", folder) for view in views]
-    for view, image, (file, arrays) in zip(views, paths, cameras, strict=True):
+    builder = SceneBuilder("lsm", folder, pixel_center="half")
+    for view, (file, arrays) in zip(views, cameras, strict=True):
         for name, shape in (("K", (3, 3)), ("extrinsic", (4, 4))):
             if name not in arrays or arrays[name].shape != shape:
                 has = arrays[name].shape if name in arrays else "none"
                 raise DataError(file, f"must hold {name}, {shape[0]} x {shape[1]}; found {has}")
-        intrinsics, extrinsic = arrays["K"], arrays["extrinsic"]
-        check_camera(intrinsics, extrinsic[:3, :3], file, "camera")
-        check_last_row(extrinsic, file, "extrinsic")
-        K.append(intrinsics)
-        E.append(extrinsic)
-        sizes.append(image_size(image))
-        depth = path_inside(folder, f"depth_{view}.png", folder)
-        depths.append(DepthPng(depth, DEPTH_STEP, (NO_DEPTH,)) if depth.exists() else None)
-    poses = np.array(E)
-    return assemble(
-        [path.name for path in paths],
-        paths,
-        make_cameras(K, poses[:, :3, :3], poses[:, :3, 3], sizes, folder, pixel_center="half"),
-        "lsm",
-        file=folder,
-        depths=depths,
-        cut_out=True,
-        category=synset_category(folder.resolve().parent.name),
-    )
+        E = arrays["extrinsic"]
+        image, depth = (path_inside(folder, f"{kind}_{view}.png", folder) for kind in ("render", "depth"))
+        builder.add(
+            image.name,
+            image,
+            arrays["K"],
+            E[:3, :3],
+            E[:3, 3],
+            "camera",
+            depth=DepthPng(depth, DEPTH_STEP, (NO_DEPTH,)) if depth.exists() else None,
+            file=file,
+        )
+        check_last_row(E, file, "extrinsic")
+    return builder.scene(cut_out=True, category=synset_category(folder.resolve().parent.name))
 
 
 def _occupancy(arrays: Arrays, side: int, file: Path) -> torch.Tensor:

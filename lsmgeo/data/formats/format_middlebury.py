@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lsmgeo.data.formats.depth_files import DepthFile, read_pfm
-from lsmgeo.data.formats.scene_assembly import assemble, check_camera, check_image_size, check_intrinsics, make_cameras
-from lsmgeo.data.images import image_size
+from lsmgeo.data.formats.scene_assembly import SceneBuilder, check_intrinsics
 from lsmgeo.data.read_files import file_reader, one_file, parse_floats, parse_ints, path_inside, plain_files, read_text
 from lsmgeo.errors import DataError
 
@@ -65,21 +64,16 @@ def read_middlebury(path: str | Path) -> PosedImages:
     if count != len(lines) - 1 or count < 1:
         raise DataError(file, f"announces {count} images but has {len(lines) - 1} lines of cameras")
 
-    names, paths, sizes = [], [], []
-    numbers = np.zeros((count, 21))
-    for view, tokens in enumerate(lines[1:]):
-        where = f"line {view + 2}"
-        if len(tokens) != 22:
-            raise DataError(file, f"{where}: expected a name and 21 numbers; got {len(tokens)} items")
-        numbers[view] = parse_floats(tokens[1:], file, where)
-        check_camera(numbers[view, :9].reshape(3, 3), numbers[view, 9:18].reshape(3, 3), file, where)
-        names.append(tokens[0])
-        paths.append(path_inside(file.parent, tokens[0], file))
+    builder = SceneBuilder("middlebury", file)
+    for number, (name, *tokens) in enumerate(lines[1:], 2):
+        where = f"line {number}"
+        if len(tokens) != 21:
+            raise DataError(file, f"{where}: expected a name and 21 numbers; got {len(tokens) + 1} items")
+        K, R, t = np.split(np.array(parse_floats(tokens, file, where)), (9, 18))
         # The format does not state sizes; they are those of the images.
-        sizes.append(image_size(paths[-1]))
-    K, R, t = np.split(numbers, (9, 18), -1)
-    cameras = make_cameras(K.reshape(-1, 3, 3), R.reshape(-1, 3, 3), t, sizes, file)
-    return assemble(names, paths, cameras, "middlebury", file=file)
+        path = path_inside(file.parent, name, file)
+        builder.add(name, path, K.reshape(3, 3), R.reshape(3, 3), t, where)
+    return builder.scene()
 
 
 @dataclass(frozen=True)
@@ -138,10 +132,6 @@ def read_stereo_pair(path: str | Path) -> PosedImages:
     Raises:
         DataError: a file is missing, damaged or too large, or leads outside the folder; or the cameras are not a
             rectified pair.
-
-    Example:
-        >>> from lsmgeo import data
-        >>> scene = data.read_stereo_pair("Motorcycle-perfect")  # doctest: +SKIP
     """
     path = Path(path)
     folder = path.parent if path.is_file() else path
@@ -156,18 +146,17 @@ def read_stereo_pair(path: str | Path) -> PosedImages:
         raise DataError(file, "cam0 and cam1 must have the same focal length and cy: this is not a rectified pair")
     if abs(second[0, 2] - first[0, 2] - offset) > ROUNDING:
         raise DataError(file, f"doffs is {offset:g}, but cx of cam1 minus cx of cam0 is {second[0, 2] - first[0, 2]:g}")
-    paths = tuple(path_inside(folder, name, file) for name in ("im0.png", "im1.png"))
-    sizes = [image_size(image) for image in paths]
+    size = None
     if "height" in entries and "width" in entries:
-        stated = tuple(parse_ints([entries["height"], entries["width"]], file, "height and width"))
-        for image, size in zip(paths, sizes, strict=True):
-            check_image_size((stated[0], stated[1]), size, image, file, "width and height")
-    cameras = make_cameras((first, second), [np.eye(3)] * 2, np.array([[0.0] * 3, [-baseline, 0.0, 0.0]]), sizes, file)
-    depths = []
-    for names in DISPARITIES:
-        here = [path_inside(folder, name, file) for name in names if (folder / name).exists()]
-        depths.append(Disparity(here[0], focal_length, baseline, offset) if here else None)
-    return assemble(("im0.png", "im1.png"), paths, cameras, "middlebury-stereo", file=file, depths=depths)
+        height, width = parse_ints([entries["height"], entries["width"]], file, "height and width")
+        size = (height, width)
+    builder = SceneBuilder("middlebury-stereo", file)
+    for name, K, x, maps in zip(("im0.png", "im1.png"), (first, second), (0.0, -baseline), DISPARITIES, strict=True):
+        here = [path_inside(folder, disparity, file) for disparity in maps if (folder / disparity).exists()]
+        depth = Disparity(here[0], focal_length, baseline, offset) if here else None
+        t = np.array([x, 0.0, 0.0])
+        builder.add(name, path_inside(folder, name, file), K, np.eye(3), t, "width and height", size=size, depth=depth)
+    return builder.scene()
 
 
 def _entries(file: Path) -> dict[str, str]:

@@ -152,10 +152,6 @@ def read_calibration(path: str | Path) -> Calibration:
     Raises:
         DataError: a file is damaged or too large, crashes its parser, states an invalid lens or rotation, or names an
             image outside its folder; two files state the same; or there is nothing to use.
-
-    Example:
-        >>> from lsmgeo import data
-        >>> calibration = data.read_calibration("intrinsics.yml")  # doctest: +SKIP
     """
     path = Path(path)
     files = calibration_files(path) if path.is_dir() else [path]

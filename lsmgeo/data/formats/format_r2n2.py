@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lsmgeo.data.formats.format_binvox import read_binvox
-from lsmgeo.data.formats.scene_assembly import assemble, make_cameras
+from lsmgeo.data.formats.scene_assembly import SceneBuilder
 from lsmgeo.data.formats.synsets import synset_category
 from lsmgeo.data.images import image_size
 from lsmgeo.data.posed_images import PosedImages
@@ -65,26 +65,17 @@ def read_r2n2(path: str | Path) -> PosedImages:
     numbers = np.array([parse_floats(line, file, f"line {number}") for number, line in enumerate(lines, 1)])
     if np.abs(numbers[:, :3]).max() > 1e4 or not ((numbers[:, 3] > 1e-3) & (numbers[:, 3] < 1e3)).all():
         raise DataError(file, "holds an angle beyond 10000 degrees, or an invalid distance")
-    names = _names(folder, len(lines))
-    paths = [path_inside(folder, name, folder / NAMES) for name in names]
-    sizes = [image_size(image) for image in paths]
-    height, width = np.array(sizes).T
-    K = np.zeros((len(lines), 3, 3))
-    K[:, 0, 0] = K[:, 1, 1] = FOCAL_LENGTH_OF_WIDTH * width
-    K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = width / 2, height / 2, 1
-    cameras = make_cameras(K, *_poses(numbers), sizes, file, pixel_center="half")
+    builder = SceneBuilder("r2n2", file, pixel_center="half")
+    for name, R, t in zip(_names(folder, len(lines)), *_poses(numbers), strict=True):
+        path = path_inside(folder, name, folder / NAMES)
+        height, width = image_size(path)
+        focal_length = FOCAL_LENGTH_OF_WIDTH * width
+        K = np.array([[focal_length, 0, width / 2], [0, focal_length, height / 2], [0, 0, 1]])
+        builder.add(name, path, K, R, t, name)
     folder_of_object = folder.resolve().parent
     voxel_file = _voxel_file(folder_of_object)
-    return assemble(
-        names,
-        paths,
-        cameras,
-        "r2n2",
-        file=file,
-        voxels=None if voxel_file is None else read_binvox(voxel_file, placement="centred"),
-        cut_out=True,
-        category=synset_category(folder_of_object.parent.name),
-    )
+    voxels = None if voxel_file is None else read_binvox(voxel_file, placement="centred")
+    return builder.scene(voxels=voxels, cut_out=True, category=synset_category(folder_of_object.parent.name))
 
 
 def _names(folder: Path, count: int) -> list[str]:

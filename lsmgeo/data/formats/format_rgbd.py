@@ -9,15 +9,7 @@ import numpy as np
 
 from lsmgeo._checks import describe
 from lsmgeo.data.formats.depth_files import DepthPng
-from lsmgeo.data.formats.scene_assembly import (
-    MAX_PARAMETER,
-    assemble,
-    check_intrinsics,
-    check_last_row,
-    check_rotation,
-    make_cameras,
-)
-from lsmgeo.data.images import image_size
+from lsmgeo.data.formats.scene_assembly import MAX_PARAMETER, SceneBuilder, check_intrinsics, check_last_row
 from lsmgeo.data.read_files import file_reader, parse_floats, path_inside, read_text
 from lsmgeo.errors import DataError, OptionError
 
@@ -75,10 +67,6 @@ def read_rgbd(path: str | Path) -> PosedImages:
 
     Raises:
         DataError: a file is missing, damaged or too large, or names a file outside the folder; or no frame is left.
-
-    Example:
-        >>> from lsmgeo import data
-        >>> scene = data.read_rgbd("hololens")  # doctest: +SKIP
     """
     path = Path(path)
     folder = path.parent if path.is_file() else path
@@ -124,22 +112,17 @@ def _scene(
     source: str,
 ) -> PosedImages:
     """The scene of frames (name, image, camera-to-world pose, depth); those without image or pose are left out."""
-    kept = [
-        (name, image, pose, DepthPng(depth, MILLIMETRE, no_depth) if depth.is_file() else None)
-        for name, image, pose, depth in frames
-        if pose is not None and image.is_file()
-    ]
-    if not kept:
+    builder = SceneBuilder(source, file)
+    for name, image, pose, depth in frames:
+        if pose is not None and image.is_file():
+            R = pose[:3, :3].T
+            # -R C, not the inverse: rotations are rounded in these files, and the camera centre should be exact.
+            t = -(R * pose[:3, 3]).sum(-1)
+            stored = DepthPng(depth, MILLIMETRE, no_depth) if depth.is_file() else None
+            builder.add(name, image, intrinsics, R, t, name, depth=stored)
+    if not builder.names:
         raise DataError(file, "has no usable frame: each has no image or a pose that is not finite")
-    names, paths, poses, depths = zip(*kept, strict=True)
-    for name, pose in zip(names, poses, strict=True):
-        check_rotation(pose[:3, :3], file, name)
-    world_from_cam = np.stack(poses)
-    R = world_from_cam[:, :3, :3].transpose(0, 2, 1)
-    # -R C, not the inverse: rotations are rounded in these files, and the camera centre should be exact.
-    t = -(R * world_from_cam[:, None, :3, 3]).sum(-1)
-    cameras = make_cameras([intrinsics] * len(names), R, t, [image_size(path) for path in paths], file)
-    return assemble(names, paths, cameras, source, file=file, depths=depths)
+    return builder.scene()
 
 
 def _read_intrinsics(file: Path) -> np.ndarray:
@@ -185,10 +168,6 @@ def read_seven_scenes(path: str | Path, *, intrinsics: tuple[float, float, float
     Raises:
         DataError: a file is damaged or too large, or leads outside the folder; or no frame is left.
         OptionError: intrinsics are not four numbers with positive focal lengths.
-
-    Example:
-        >>> from lsmgeo import data
-        >>> scene = data.read_seven_scenes("chess/seq-01", intrinsics=(525.0, 525.0, 320.0, 240.0))  # doctest: +SKIP
     """
     K = _matrix(intrinsics)
     folder = Path(path)

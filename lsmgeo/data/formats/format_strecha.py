@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lsmgeo.data.formats.scene_assembly import assemble, check_camera, check_image_size, make_cameras
-from lsmgeo.data.images import image_size
+from lsmgeo.data.formats.scene_assembly import SceneBuilder
 from lsmgeo.data.posed_images import PosedImages
 from lsmgeo.data.read_files import file_reader, parse_floats, path_inside, plain_files, read_text
 from lsmgeo.errors import DataError
@@ -56,28 +55,20 @@ def read_strecha(path: str | Path) -> PosedImages:
     if len(folders) != 1:
         found = ", ".join(folder.name for folder in folders[:5]) or "none"
         raise DataError(path, f"expected *{SUFFIX} files in one folder; found {found}")
-    names, paths, sizes = [], [], []
-    intrinsics, rotations, translations = [], [], []
+    builder = SceneBuilder("strecha", folders[0])
     for file in files:
         numbers = parse_floats(read_text(file, MAX_CAMERA_BYTES).split(), file, "camera")
         if len(numbers) != sum(PARTS):
             raise DataError(file, f"expected {sum(PARTS)} numbers (K, distortion, R, centre, size); got {len(numbers)}")
-        parts = np.split(np.array(numbers), np.cumsum(PARTS)[:-1])
-        matrix, radial, rotation, center, (width, height) = parts
+        matrix, radial, rotation, center, (width, height) = np.split(np.array(numbers), np.cumsum(PARTS)[:-1])
         if radial.any():
             raise DataError(file, "has radial distortion, whose model the format does not define; undistort first")
-        intrinsics.append(matrix.reshape(3, 3))
-        check_camera(intrinsics[-1], rotation.reshape(3, 3), file, "camera")
         if np.abs(center).max() > 1e12:
             raise DataError(file, "the camera centre is beyond 1e12")
-        names.append(file.name.removesuffix(SUFFIX))
-        paths.append(_image(file, names[-1]))
-        sizes.append(image_size(paths[-1]))
-        check_image_size((height, width), sizes[-1], paths[-1], file, "camera")
-        rotations.append(rotation.reshape(3, 3).T)
-        translations.append(-rotations[-1] @ center)
-    cameras = make_cameras(intrinsics, rotations, translations, sizes, folders[0])
-    return assemble(names, paths, cameras, "strecha", file=folders[0])
+        name, R = file.name.removesuffix(SUFFIX), rotation.reshape(3, 3).T
+        size = (height, width)
+        builder.add(name, _image(file, name), matrix.reshape(3, 3), R, -R @ center, "camera", size=size, file=file)
+    return builder.scene()
 
 
 def _image(file: Path, name: str) -> Path:

@@ -17,13 +17,14 @@ from lsmgeo.data.formats.lenses import Lens
 from lsmgeo.data.formats.scene_assembly import (
     MAX_PARAMETER,
     MAX_SIDE,
+    any_alpha,
     assemble,
     camera_errors_as_data_errors,
     check_image_size,
     check_last_row,
     check_rotation,
 )
-from lsmgeo.data.images import SUFFIXES, has_alpha, image_size
+from lsmgeo.data.images import SUFFIXES, image_size
 from lsmgeo.data.json_files import read_array, read_json, read_number, read_string, sniff_json
 from lsmgeo.data.posed_images import PosedImages
 from lsmgeo.data.read_files import file_reader, one_file, path_inside, plain_files
@@ -89,7 +90,6 @@ def read_transforms(path: str | Path) -> PosedImages:
     names, paths, sizes, intrinsics, poses = [], [], [], [], []
     lenses: list[Lens | None] = []
     depths: list[DepthFile | None] = []
-    cut_out = False
     shared: dict[tuple[Any, ...], Lens] = {}
     for index, frame in enumerate(frames):
         where = f"frame {index}"
@@ -98,7 +98,6 @@ def read_transforms(path: str | Path) -> PosedImages:
         names.append(_read_name(frame, "file_path", file, where))
         paths.append(_image(file, names[-1]))
         size = image_size(paths[-1])
-        cut_out = cut_out or has_alpha(paths[-1])
         stated = _FrameCamera(file, where, values, frame)
         check_image_size(stated.size(size), size, paths[-1], file, where)
         sizes.append(size)
@@ -112,6 +111,7 @@ def read_transforms(path: str | Path) -> PosedImages:
     height, width = torch.tensor(sizes).unbind(-1)
     with camera_errors_as_data_errors(file):
         cameras = from_opengl(torch.from_numpy(np.stack(intrinsics)), torch.from_numpy(np.stack(poses)), height, width)
+    cut_out = any_alpha(paths)
     return assemble(names, paths, cameras, "transforms", file=file, lenses=lenses, depths=depths, cut_out=cut_out)
 
 

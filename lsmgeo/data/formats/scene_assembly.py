@@ -1,4 +1,4 @@
-"""What every reader of posed images needs: checks of the stated cameras, and `assemble`, which makes the scene."""
+"""What every reader of posed images needs: checks of the stated cameras, and `SceneBuilder`, which makes the scene."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from lsmgeo.cameras import from_opencv
+from lsmgeo.data.images import has_alpha, image_size
 from lsmgeo.data.posed_images import PosedImages
 from lsmgeo.errors import DataError, LsmGeoError
 
@@ -16,22 +17,20 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    import numpy.typing as npt
-
     from lsmgeo.cameras import CameraTensors
     from lsmgeo.data.formats.depth_files import DepthFile
     from lsmgeo.data.formats.lenses import Lens
     from lsmgeo.data.posed_images import SparsePoints, Voxels
 
 __all__ = [
+    "SceneBuilder",
+    "any_alpha",
     "assemble",
     "camera_errors_as_data_errors",
-    "check_camera",
     "check_image_size",
     "check_intrinsics",
     "check_last_row",
     "check_rotation",
-    "make_cameras",
 ]
 
 # The largest images have such sides; a larger number is damaged.
@@ -77,12 +76,6 @@ def check_rotation(rotation: np.ndarray, file: Path, where: str) -> None:
         raise DataError(file, f"{where}: the rotation is scaled by {scale:.6g}; divide it by that")
 
 
-def check_camera(intrinsics: np.ndarray, rotation: np.ndarray, file: Path, where: str) -> None:
-    """`check_intrinsics` and `check_rotation`."""
-    check_intrinsics(intrinsics, file, where)
-    check_rotation(rotation, file, where)
-
-
 def check_last_row(pose: np.ndarray, file: Path, what: str) -> None:
     """Raise a DataError unless the last row of a pose (4, 4) is 0 0 0 1."""
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
@@ -99,20 +92,83 @@ def check_image_size(stated: tuple[float, float], found: tuple[int, int], image:
         )
 
 
-def make_cameras(
-    intrinsics: npt.ArrayLike,
-    rotations: npt.ArrayLike,
-    translations: npt.ArrayLike,
-    sizes: Sequence[tuple[int, int]],
-    file: Path,
-    *,
-    pixel_center: str = "integer",
-) -> CameraTensors:
-    """Cameras (V,) from K (V, 3, 3), world-to-camera R (V, 3, 3), t (V, 3) and sizes; a DataError of ``file``."""
-    K, R, t = (torch.from_numpy(np.array(part, np.float64)) for part in (intrinsics, rotations, translations))
-    height, width = torch.tensor(sizes).unbind(-1)
-    with camera_errors_as_data_errors(file):
-        return from_opencv(K, R, t, height, width, pixel_center=pixel_center)
+def any_alpha(paths: Sequence[Path]) -> bool:
+    """Whether any of the images has transparency, so that the scene is cut out."""
+    return any(map(has_alpha, paths))
+
+
+class SceneBuilder:
+    """Collects the views of a scene, checks each, and makes the scene.
+
+    Args:
+        source: the name of the format.
+        file: the file or folder that states the cameras, for errors.
+        pixel_center: of K, "integer" or "half".
+    """
+
+    def __init__(self, source: str, file: Path, *, pixel_center: str = "integer") -> None:
+        self.source, self.file, self.pixel_center = source, file, pixel_center
+        self.names: list[str] = []
+        self.paths: list[Path] = []
+        self._cameras: list[tuple[object, ...]] = []  # K, R, t, height, width
+        self._depths: list[DepthFile | None] = []
+
+    def add(
+        self,
+        name: str,
+        path: Path,
+        intrinsics: np.ndarray,
+        rotation: np.ndarray,
+        translation: np.ndarray,
+        where: str,
+        *,
+        size: tuple[float, float] | None = None,
+        depth: DepthFile | None = None,
+        file: Path | None = None,
+    ) -> None:
+        """Add a view.
+
+        Args:
+            name: the name of the image in the source.
+            path: its file; the size of the image is that in its header.
+            intrinsics: K (3, 3).
+            rotation: world-to-camera R (3, 3).
+            translation: t (3,).
+            where: the view's place in the file, for errors.
+            size: (height, width) as the source states it, if it does.
+            depth: of the image.
+            file: the file of this view's camera, if each has its own.
+
+        Raises:
+            DataError: the image cannot be read, or the camera is invalid or of another size.
+        """
+        file = self.file if file is None else file
+        found = image_size(path)
+        if size is not None:
+            check_image_size(size, found, path, file, where)
+        check_intrinsics(intrinsics, file, where)
+        check_rotation(rotation, file, where)
+        self.names.append(name)
+        self.paths.append(path)
+        self._cameras.append((intrinsics, rotation, translation, *found))
+        self._depths.append(depth)
+
+    def scene(self, *, cut_out: bool = False, voxels: Voxels | None = None, category: str | None = None) -> PosedImages:
+        """The scene of the views, see `assemble`."""
+        K, R, t, height, width = (torch.from_numpy(np.array(part)) for part in zip(*self._cameras, strict=True))
+        with camera_errors_as_data_errors(self.file):
+            cameras = from_opencv(K, R, t, height, width, pixel_center=self.pixel_center)
+        return assemble(
+            self.names,
+            self.paths,
+            cameras,
+            self.source,
+            file=self.file,
+            depths=self._depths,
+            cut_out=cut_out,
+            voxels=voxels,
+            category=category,
+        )
 
 
 def assemble(

@@ -1,4 +1,4 @@
-"""Meshes read from files that nobody vouches for."""
+"""Reading meshes from untrusted files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_FACES = 1 << 21
 MAX_LIBRARY_BYTES = 1 << 22
 MAX_LIBRARIES = 16
 FARTHEST = 1e15
-# What a guarded parser may use.
+# Limits of a guarded parser.
 GUARD_SECONDS = 60.0
 GUARD_MEMORY = 1 << 30
 GUARD_MEMORY_OF_A_BYTE = 8
@@ -38,33 +38,31 @@ def load_mesh(
 ) -> Mesh:
     r"""Read the triangles and plain colours of an OBJ, PLY, OFF, STL, GLB or glTF file.
 
-    The file is hostile until checked. PLY and glTF are parsed by trimesh, the others here: all Python and numpy, no
-    native decoder that a file could crash. What a file announces is compared with its size first, and no other file is
-    taken. So reading is not guarded by default, as a process more costs from 0.2 s (OBJ, OFF, STL) to 1.5 s a mesh;
-    take ``guarded=True`` for files from strangers: the parser then runs in an isolated process with limited memory and
-    time.
+    What a file announces is compared with its size first, and it is parsed only by Python and NumPy (PLY and glTF by
+    trimesh), without native decoders. So parsing is not isolated by default: a process takes from 0.2 s (OBJ, OFF, STL)
+    to 1.5 s for each mesh. Pass ``guarded=True`` for files from strangers: the parser then runs in an isolated process
+    with limited memory and time.
 
-    What is read: polygons, as fans of triangles about their first vertex; colours of faces, or the means of colours of
-    vertices; of OBJ, the diffuse colours (Kd) of material files in the same folder or below (a missing one is passed
-    over, as ShapeNet lacks some); of glTF, transforms, baseColorFactor and vertex colours of the scene.
-    No textures: a face that has only a texture is grey, or has its material's plain colour. Vertices that no face uses
-    are dropped; nothing is moved, merged or repaired. What is refused: a binary PLY with lists of differing length, as
-    of triangles and quads (save it as text), a PLY whose faces have a second list, a glTF
-    with strips or fans, of lines too, with sparse or compressed data, or without a scene.
+    Read are polygons, as fans of triangles about their first vertex; colours of faces, or means of the colours of their
+    vertices; of OBJ, diffuse colours (Kd) in material files in the same folder or below, if they exist; of glTF, the
+    scene's transforms, baseColorFactor and vertex colours. Textures are not read: such a face has the plain colour of
+    its material, or grey. Vertices without a face are dropped; nothing is moved, merged or repaired. Refused are a
+    binary PLY with lists of different lengths, such as triangles and quads (save it as text), a PLY whose faces have a
+    second list, and a glTF with strips or fans, sparse or compressed data, or no scene.
 
     Args:
-        path: the file; its ending names the format and its content must agree.
-        max_bytes: largest file accepted.
-        max_faces: most triangles accepted.
-        guarded: parse in another process.
+        path: the file, whose suffix states the format.
+        max_bytes: the largest file accepted.
+        max_faces: the largest number of triangles accepted.
+        guarded: parse in an isolated process.
 
     Returns:
         The mesh, in the file's own frame and units.
 
     Raises:
-        DataError: the file is missing, too large, of another format, damaged, refers to files outside (glTF buffers,
-            paths of OBJ materials that leave the folder), has a vertex that is not finite, a face that names no vertex,
-            or no face with an area.
+        DataError: the file is missing, too large, of another format or damaged, refers to files outside (glTF buffers,
+            OBJ materials outside the folder), has a vertex that is not finite, a face with a vertex out of range, or no
+            face with an area.
         OptionError: a limit below 1.
 
     Example:
@@ -84,7 +82,7 @@ def load_mesh(
     path = Path(path)
     kind = path.suffix[1:].lower()
     if kind not in KINDS:
-        raise DataError(path, f"is no mesh that can be read; expected a name that ends in one of {', '.join(KINDS)}")
+        raise DataError(path, f"is not a mesh; expected a name that ends in one of {', '.join(KINDS)}")
     content = read_bytes(path, max_bytes)
     options = (kind, max_faces, _material_colours(path, content) if kind == "obj" else {})
     try:
@@ -100,13 +98,13 @@ def load_mesh(
 
 
 def _checked(path: Path, parsed: Mapping[str, np.ndarray], max_faces: int) -> Mesh:
-    """A mesh of the vertices that faces use; what a parser says is believed no more than the file."""
+    """The mesh without unused vertices; the output of a parser is as untrusted as its file."""
     try:
         whole = Mesh(parsed["vertices"], parsed["faces"])
         with np.errstate(over="ignore"):
             colours = parsed["colours"].astype(np.float32).reshape(whole.faces.shape)
     except (LsmGeoError, KeyError, ValueError) as error:
-        raise DataError(path, f"holds no mesh ({error})") from error
+        raise DataError(path, f"holds an invalid mesh ({error})") from error
     if not len(whole.faces) or len(whole.faces) > max_faces:
         raise DataError(path, f"holds no face, or more than the limit of {max_faces}; got {len(whole.faces)}")
     if np.abs(whole.vertices).max() > FARTHEST:
@@ -114,7 +112,7 @@ def _checked(path: Path, parsed: Mapping[str, np.ndarray], max_faces: int) -> Me
     used, faces = np.unique(whole.faces, return_inverse=True)
     vertices, faces = whole.vertices[used], faces.reshape(-1, 3)
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    # Relative to the mesh, so that neither a tiny nor a huge unit makes rounding look like area.
+    # Relative to the size of the mesh, so that rounding is no area in any unit.
     size = np.ptp(vertices, 0).max()
     if not (np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-14 * size * size).any():
         raise DataError(path, "has no face with an area")

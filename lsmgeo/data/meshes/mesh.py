@@ -1,4 +1,4 @@
-"""Triangle meshes: one plain value."""
+"""Triangle meshes: a plain value."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 __all__ = ["DEFAULT_COLOUR", "Mesh", "check_mesh", "from_trimesh", "normalise"]
 
-# What has no colour of its own: the grey of a default `lsmgeo.scenes.Material`.
+# Of faces without a colour: the grey of a default `lsmgeo.scenes.Material`.
 DEFAULT_COLOUR = (0.7, 0.7, 0.7)
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles, checked when made; arrays must not be changed afterwards.
+    """Triangles, checked at construction; the arrays must not be modified.
 
     Attributes:
         vertices: (N, 3) float64, finite, world units.
@@ -33,8 +33,8 @@ class Mesh:
 
     Raises:
         ShapeError: a wrong shape.
-        DTypeError: no array of numbers.
-        OptionError: a face that names no vertex, a number that is not finite, a colour outside [0, 1].
+        DTypeError: not an array of numbers.
+        OptionError: a face with a vertex out of range, a number that is not finite, a colour outside [0, 1].
 
     Example:
         >>> import numpy as np
@@ -79,12 +79,12 @@ class Mesh:
 
     @cached_property
     def watertight(self) -> bool:
-        """Whether every edge belongs to exactly two faces; vertices in one place count as one."""
+        """Whether every edge belongs to exactly two faces; coinciding vertices count as one."""
         return is_watertight(self.vertices, self.faces)
 
     @cached_property
     def bounds(self) -> np.ndarray:
-        """(2, 3): the least and the greatest x, y, z of the vertices that faces use."""
+        """(2, 3): minimum and maximum x, y, z of the vertices of faces."""
         used = self.vertices[np.unique(self.faces)]
         return np.stack((used.min(0), used.max(0)))
 
@@ -98,7 +98,7 @@ def _array(name: str, value: object, expected: str, kinds: str, dtype: type) -> 
 
 
 def check_mesh(who: str, mesh: object, *, least: int = 1) -> None:
-    """Require a `Mesh` of so many faces."""
+    """Raise unless ``mesh`` is a `Mesh` with at least ``least`` faces."""
     if not isinstance(mesh, Mesh):
         raise DTypeError(f"{who}: mesh must be a lsmgeo.data.Mesh (see from_trimesh); got {describe(mesh)}")
     if len(mesh.faces) < least:
@@ -106,7 +106,7 @@ def check_mesh(who: str, mesh: object, *, least: int = 1) -> None:
 
 
 def from_trimesh(mesh: trimesh.Trimesh) -> Mesh:
-    """A `trimesh.Trimesh` as a `Mesh`; colours of faces or vertices are kept, textures are not.
+    """A `trimesh.Trimesh` as a `Mesh`, with colours of faces or vertices but no textures.
 
     Example:
         >>> import trimesh
@@ -134,7 +134,7 @@ def normalise(mesh: Mesh, *, to: str = "diagonal") -> Mesh:
     Raises:
         DTypeError: not a `Mesh`.
         ShapeError: a mesh without faces.
-        OptionError: another `to`, or a mesh that is a single point.
+        OptionError: another `to`, or a mesh of zero size.
 
     Example:
         >>> import trimesh
@@ -150,6 +150,6 @@ def normalise(mesh: Mesh, *, to: str = "diagonal") -> Mesh:
     extent = high - low
     size = float(np.linalg.norm(extent) if to == "diagonal" else extent.max())
     if not 0 < size < np.inf:
-        raise OptionError(f"{who}: mesh must have a size; got one of {size}")
+        raise OptionError(f"{who}: mesh must have a size that is positive and finite; got {size}")
     # Halves first: the sum of two large coordinates could overflow.
     return replace(mesh, vertices=(mesh.vertices - (0.5 * low + 0.5 * high)) / size)

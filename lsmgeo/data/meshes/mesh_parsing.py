@@ -1,8 +1,8 @@
-"""Triangles and plain colours out of the bytes of a mesh file, whoever made it; imports nothing of this package.
+"""Parses triangles and plain colours from the bytes of untrusted mesh files; imports nothing of this package.
 
-PLY and glTF are read by trimesh, after a look at what they announce. The other formats are read here: trimesh takes
-vertex 0 of an OBJ, and one counted backwards, for another vertex, reorders its faces by material, and accepts faces of
-an OFF that are cut short.
+PLY and glTF are parsed by trimesh, after a check of what they announce. The other formats are parsed here: trimesh
+misreads vertex 0 of an OBJ and negative vertex numbers, reorders its faces by material, and accepts truncated faces of
+an OFF.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["KINDS", "parse_mesh"]
 MAX_LINE = 1 << 16
 MAX_NODES = 1 << 16
 RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
-# Bytes of glTF's components, numbers of its types, and extensions that leave triangles as they are.
+# Bytes of glTF's components, numbers of its types, and extensions that do not change triangles.
 BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 DRACO = "KHR_draco_mesh_compression"
@@ -38,11 +38,11 @@ Materials = Mapping[str, Sequence[float]]
 
 
 class Unreadable(ValueError):
-    """What is wrong with the bytes, in words for whoever has the file."""
+    """The reason why a file cannot be read."""
 
 
 class Parsed(NamedTuple):
-    """What a file says: vertices (N, 3), faces (F, 3), indices unchecked, and colours (F, 3), NaN for none."""
+    """The content of a file: vertices (N, 3), faces (F, 3), indices unchecked, and colours (F, 3), NaN for none."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -50,36 +50,36 @@ class Parsed(NamedTuple):
 
 
 def parse_mesh(content: bytes, kind: str, max_faces: int, materials: Materials) -> dict[str, np.ndarray]:
-    """Read the bytes of a mesh file.
+    """Parse the bytes of a mesh file.
 
     Args:
-        content: the whole file.
+        content: of the file.
         kind: one of `KINDS`.
-        max_faces: most triangles accepted.
+        max_faces: the largest number of triangles accepted.
         materials: the diffuse colours of an OBJ file's materials.
 
     Returns:
-        vertices (N, 3) and faces (F, 3), indices unchecked, and colours (F, 3) as written, NaN where a face has none.
+        The fields of `Parsed`.
 
     Raises:
-        ValueError: whatever is wrong.
+        ValueError: the file cannot be read, for this reason.
     """
     try:
-        # NumPy warns where text that should be numbers ends before its end.
+        # NumPy warns of text that is not all numbers.
         with np.errstate(all="ignore"), warnings.catch_warnings(action="error", category=DeprecationWarning):
             parsed = PARSERS[kind](content, max_faces, materials)
     except Unreadable:
         raise
     except MemoryError as error:
-        raise Unreadable("needs more memory than there is") from error
-    # Damaged files provoke nearly everything.
+        raise Unreadable("needs more memory than available") from error
+    # Damaged files raise many kinds of errors.
     except Exception as error:
         raise Unreadable(f"is damaged ({type(error).__name__}: {str(error)[:200]})") from error
     return parsed._asdict()
 
 
 def _obj(content: bytes, max_faces: int, materials: Materials) -> Parsed:
-    """Wavefront OBJ: v (with colours, if any), f and usemtl; all else is passed over."""
+    """Wavefront OBJ: v (with colours, if any), f and usemtl; all else is ignored."""
     points, tints, corners, sizes, owners = array("d"), array("d"), array("q"), array("q"), array("d")
     colour: Sequence[float] = (np.nan,) * 3
     for line in _text_lines(content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")):
@@ -95,7 +95,7 @@ def _obj(content: bytes, max_faces: int, materials: Materials) -> Parsed:
             count, before = len(points) // 3, len(corners)
             for token in rest.split():
                 index = int(token.split(b"/", 1)[0][:20])
-                # Counted from 1, or backwards from the newest vertex; a face may name only vertices before it.
+                # Counted from 1, or backwards from the last vertex; all vertices of a face precede it.
                 if index == 0 or abs(index) > count:
                     raise Unreadable(f"a face names vertex {index}, of {count} so far")
                 corners.append(index - 1 if index > 0 else count + index)
@@ -113,7 +113,7 @@ def _off(content: bytes, max_faces: int, _: Materials) -> Parsed:
     lines = _text_lines(content)
     head = next(lines, b"").split()
     if not head or head[0] not in (b"OFF", b"COFF"):
-        raise Unreadable("is not an OFF file (OFF or COFF must stand first)")
+        raise Unreadable("is not an OFF file (it must begin with OFF or COFF)")
     counts = [int(token[:20]) for token in (head[1:] or next(lines, b"").split())]
     if len(counts) not in (2, 3) or min(counts[:2]) < 0 or 2 * (counts[0] + counts[1]) > len(content):
         raise Unreadable(f"announces {counts[:3]} vertices, faces and edges, more than it can hold")
@@ -139,7 +139,7 @@ def _off(content: bytes, max_faces: int, _: Materials) -> Parsed:
 
 
 def _stl(content: bytes, max_faces: int, _: Materials) -> Parsed:
-    """Stereolithography, binary (its size must be what its count says) or text."""
+    """Stereolithography, binary (if its size fits its count) or text."""
     if len(content) >= 84 and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little"):
         points = np.frombuffer(content, RECORD, offset=84)["corners"].astype(np.float64).reshape(-1, 3)
     elif content.lstrip()[:5] == b"solid":
@@ -151,7 +151,7 @@ def _stl(content: bytes, max_faces: int, _: Materials) -> Parsed:
                 found.extend(_floats(tokens[1:]))
         points = np.array(found).reshape(-1, 3)
     else:
-        raise Unreadable("is not an STL file (neither text nor as long as its count says)")
+        raise Unreadable("is not an STL file (neither text nor of the length of its count)")
     if len(points) % 3:
         raise Unreadable("ends inside a triangle")
     return _fans(points, np.arange(len(points)), np.full(len(points) // 3, 3), max_faces)
@@ -166,23 +166,21 @@ def _ply(content: bytes, max_faces: int, _: Materials) -> Parsed:
     if form is None:
         raise Unreadable("is not a PLY file (no header from ply and format to end_header, or an unknown line in it)")
     text = form[1] == b"ascii"
-    # Each line of text is held as an array.
+    # trimesh makes an array of each line of text.
     lines = body.count(b"\n") + body.count(b"\r") if text else 0
     if lines > 8 * max_faces + MAX_LINE or (text and body.translate(None, b"0123456789+-.eEnNaAiIfF \t\r\n")):
-        raise Unreadable("holds what is no number, or more lines than the limit of faces allows")
+        raise Unreadable("holds values that are not numbers, or more lines than the limit of faces allows")
     try:
         elements = load_ply(io.BytesIO(content), skip_materials=True)["metadata"]["_ply_raw"]
     except ValueError as error:
-        hint = (
-            "" if text else ", or binary with lists of differing length, as of triangles and quads, which are not read"
-        )
+        hint = "" if text else ", or binary with lists of different lengths (triangles and quads), which are not read"
         raise Unreadable(f"is damaged ({error}){hint}") from error
     for name, element in elements.items():
         rows = element.get("data")
         columns = [] if text or rows is None else [rows[column] for column in rows.dtype.names]
         lists = [column for column in columns if column.dtype.names]
         if any((column["f0"] != column["f1"].shape[1]).any() for column in lists):
-            raise Unreadable(f"has lists of differing length in {name}; in a binary file they are not read")
+            raise Unreadable(f"has lists of different lengths in {name}, which are not read from a binary file")
     vertex, face = (elements[name]["data"] for name in ("vertex", "face"))
     properties = list(elements["face"]["properties"])
     place = next(place for place, name in enumerate(properties) if name in ("vertex_indices", "vertex_index"))
@@ -209,7 +207,7 @@ def _ply(content: bytes, max_faces: int, _: Materials) -> Parsed:
 def _glb(content: bytes, max_faces: int, _: Materials) -> Parsed:
     """Binary glTF: as text, after 20 bytes of header."""
     if int.from_bytes(content[8:12], "little") != len(content):
-        raise Unreadable(f"is no glTF of {len(content)} bytes")
+        raise Unreadable(f"is not a glTF of {len(content)} bytes")
     return _gltf(content, max_faces, content[20 : 20 + int.from_bytes(content[12:16], "little")])
 
 
@@ -223,7 +221,7 @@ def _gltf(content: bytes, max_faces: int, text: Any) -> Parsed:
     nodes, meshes, accessors, views, buffers = lists
     primitives = [primitive for mesh in meshes for primitive in mesh["primitives"]]
     if max(map(len, (nodes, primitives, accessors, views, buffers))) > MAX_NODES:
-        raise Unreadable(f"has more parts than {MAX_NODES}")
+        raise Unreadable(f"has more than {MAX_NODES} nodes, primitives, accessors or buffers")
     required = [str(name) for name in document.get("extensionsRequired", []) if not str(name).startswith(HARMLESS)]
     if required:
         raise Unreadable(f"requires the extension {required[0][:60]}, which is not read")
@@ -235,24 +233,21 @@ def _gltf(content: bytes, max_faces: int, text: Any) -> Parsed:
             raise Unreadable(f"has a buffer of fewer bytes than the {length} that it announces")
     if any("sparse" in accessor or "bufferView" not in accessor for accessor in accessors):
         raise Unreadable("has a sparse or empty accessor, which is not read")
-    # trimesh itself compares these with the buffers by assertions, which Python may be told to leave out.
+    # trimesh compares these with the buffers only by assertions, which Python can disable.
     for part in (*views, *accessors):
         for name in ("byteOffset", "byteLength", "byteStride"):
             _whole(part.get(name, 0))
     held = [BYTES[a["componentType"]] * WIDTHS[a["type"]] * _whole(a["count"]) for a in accessors]
     if sum(held) + sum(view["byteLength"] for view in views) > 8 * len(content):
         raise Unreadable("announces more than it can hold")
-    if any(
-        primitive.get("mode", 4) not in (0, 1, 4) or DRACO in primitive.get("extensions", {})
-        for primitive in primitives
-    ):
+    if any(p.get("mode", 4) not in (0, 1, 4) or DRACO in p.get("extensions", {}) for p in primitives):
         raise Unreadable("has strips, fans or compressed triangles, which are not read")
     # A tree visits each node once: a second visit is a cycle or a node with two parents.
     roots = document["scenes"][_whole(document.get("scene", 0))].get("nodes", [])
     visited = [*roots, *(child for node in nodes for child in node.get("children", []))]
     if len({*visited}) != len(visited) or not all(_whole(number) < len(nodes) for number in visited):
-        raise Unreadable("its nodes are no tree")
-    # Counted before anything is made, as one mesh may stand in many places.
+        raise Unreadable("its nodes are not a tree")
+    # Counted before anything is allocated, as many nodes may place one mesh.
     corners = 0
     for node in nodes:
         for primitive in meshes[_whole(node["mesh"])]["primitives"] if "mesh" in node else ():
@@ -271,7 +266,7 @@ def _gltf(content: bytes, max_faces: int, text: Any) -> Parsed:
         if "faces" not in mesh:
             continue
         points, faces = mesh["vertices"].astype(np.float64), mesh["faces"].astype(np.int64)
-        # A mirroring transform turns faces inside out; glTF says to turn them back.
+        # A mirroring transform reverses the orientation of faces; glTF requires to restore it.
         placed_faces = faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces
         tint = np.tile(tints[edge["geometry"]], (len(faces), 1))
         if "vertex_colors" in mesh:
@@ -303,12 +298,12 @@ KINDS = tuple(PARSERS)
 
 def _whole(value: Any) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**40:
-        raise Unreadable(f"expected a whole number, 0 at least; got {str(value)[:40]}")
+        raise Unreadable(f"expected a whole number of at least 0; got {str(value)[:40]}")
     return value
 
 
 def _fractions(values: np.ndarray) -> np.ndarray:
-    """Colours in [0, 1] of whole numbers of their type."""
+    """Colours in [0, 1] from integers of the full range of their type."""
     return values / float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else values.astype(np.float64)
 
 
@@ -320,7 +315,7 @@ def _fans(
     of_vertices: np.ndarray | None = None,
     of_polygons: np.ndarray | None = None,
 ) -> Parsed:
-    """Polygons (their vertices one after another, their sizes) as fans, coloured like them or by mean of vertices."""
+    """Fans of polygons (concatenated vertices, sizes), with the polygons' colours, else means of the vertices'."""
     corners, sizes = np.array(corners, np.int64), np.array(sizes, np.int64)
     triangles = np.maximum(sizes - 2, 0)
     if int(triangles.sum()) > max_faces:
@@ -336,7 +331,7 @@ def _fans(
 
 
 def _text_lines(content: bytes) -> Iterator[bytes]:
-    """Lines without what follows a #, without blanks around and without empty ones."""
+    """The lines that are not empty, without comments (#) and surrounding blanks."""
     if b"\0" in content:
         raise Unreadable("is not a text file (it holds a zero byte)")
     for line in io.BytesIO(content):
@@ -348,7 +343,7 @@ def _text_lines(content: bytes) -> Iterator[bytes]:
 
 
 def _floats(tokens: list[bytes]) -> list[float]:
-    """Numbers from text, of which one that is absurdly long is none."""
+    """Numbers from text, each of at most 64 characters."""
     if any(len(token) > 64 for token in tokens):
         raise Unreadable("has a number of more than 64 characters")
     return [float(token) for token in tokens]

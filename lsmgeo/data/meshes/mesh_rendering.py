@@ -1,4 +1,4 @@
-"""Images of meshes on the CPU: colour, depth, normals and silhouettes, shaded as analytic scenes are."""
+"""Rendering meshes on the CPU: colour, depth, normals and masks, with the shading of analytic scenes."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from lsmgeo.scenes.inputs import background_array, checked_lights
 
 __all__ = ["render_mesh"]
 
-# Shadow rays leave a surface from this far above it, relative to the size of the mesh, however far the camera is: well
-# above what float32 loses there, well below a pixel.
+# Shadow rays begin this far above a surface, relative to the size of the mesh: well above the errors of float32, well
+# below a pixel.
 SHADOW_OFFSET = 1e-4
 RAYS_AT_ONCE = 1 << 18
 BACKENDS = ("embree", "numpy")
-# Leaves of the numpy tree hold this many triangles, and this many (ray, box) pairs are held at once.
+# Triangles in a leaf of the numpy tree, and (ray, box) pairs in memory at once.
 LEAF = 4
 PAIRS = 1 << 20
 
@@ -47,35 +47,34 @@ def render_mesh(
 ) -> Rendering:
     """Render a mesh: the first triangle on the ray of each pixel's centre, shaded by `lsmgeo.scenes.shade`.
 
-    Faces are seen from both sides. Smooth normals are the angle-weighted means of the faces around a vertex, taken over
-    the edges that bend by less than ``crease``; so a box keeps its edges and a sphere shows none. They turn towards the
-    viewer, and silhouettes, depth and shadows stay those of the triangles. The same input gives the same bits.
+    Faces are visible from both sides. Smooth normals are angle-weighted means over the faces around a vertex that are
+    connected by edges that bend by less than ``crease``: a box keeps its edges and a sphere has none. Normals point
+    towards the viewer; masks, depth and shadows are those of the triangles. The same input gives the same bits.
 
     Convention:
         Depth is camera z. Integer pixel centres. One ray a pixel, no antialiasing.
 
     Args:
-        mesh: any `Mesh`, world frame; without face colours it is grey, 0.7.
+        mesh: any `Mesh`, world frame; grey (0.7) without face colours.
         cameras: leading shape (V,), all images of one size.
         lights: directions and colours (L, 3), ambient (3,).
         shadows: whether the mesh blocks the lights.
-        smooth: whether to interpolate normals; else each face is flat.
+        smooth: whether to interpolate normals; else faces are flat.
         crease: degrees, 0 to 180.
-        background: RGB behind the mesh, (3,), or anything that broadcasts to (V, 3, H, W).
-        size: (H, W) of the images; by default the cameras' own. K is resized for it.
+        background: RGB (3,), or anything that broadcasts to (V, 3, H, W).
+        size: (H, W) of the images, for which K is resized; by default that of the cameras.
         backend: "embree", "numpy" (needs no extra package; far slower), or "auto": the first that is installed.
 
     Returns:
         `lsmgeo.scenes.Rendering` on the CPU, without the axis of scenes: images (V, 3, H, W) float32, depth (V, H, W)
-        float32, world normals (V, 3, H, W) float32 and mask (V, H, W) bool. Not differentiable: tensors that
-        require gradients are taken as they are, and the result requires none.
+        float32, world normals (V, 3, H, W) float32 and mask (V, H, W) bool. Not differentiable.
 
     Raises:
         DTypeError: not a `Mesh`, not `Lights`.
-        ShapeError: shapes that do not belong together.
-        OptionError: an impossible option.
-        CameraError: bad cameras, or views of different sizes and no ``size``.
-        BackendError: embree was asked for by name and is not installed, or ``smooth`` without scipy.
+        ShapeError: shapes that do not match.
+        OptionError: an invalid option.
+        CameraError: invalid cameras, or views of different sizes without ``size``.
+        BackendError: backend "embree" is not installed, or ``smooth`` without SciPy.
 
     Example:
         >>> import torch, trimesh
@@ -115,7 +114,7 @@ def render_mesh(
         pixels = (np.arange(top, bottom)[:, None] * size[1] + np.arange(left, right)).reshape(-1)
         for begin in range(0, len(pixels), RAYS_AT_ONCE):
             some = pixels[begin : begin + RAYS_AT_ONCE]
-            # Camera z of these directions is 1, so a distance along them is a depth.
+            # Camera z of these directions is 1, so distances along them are depths.
             rays = np.stack((some % size[1], some // size[1], np.ones(len(some))))
             directions = (from_pixel[view] @ rays).T
             surface.render(Rendering(*(field[view] for field in out)), some, centers[view], directions, lights, shadows)
@@ -127,7 +126,7 @@ class _Surface:
 
     def __init__(self, mesh: Mesh, flat: np.ndarray, corners: np.ndarray | None, backend: str) -> None:
         self.mesh, self.caster = mesh, _make_caster(mesh.vertices, mesh.faces, backend)
-        # Directions need no more than float32, and half the memory is read.
+        # float32 suffices for directions, and halves the memory traffic.
         self.flat = flat.astype(np.float32)
         self.corners = None if corners is None else corners.astype(np.float32)
         self.extent = float(np.ptp(mesh.bounds, 0).max())
@@ -165,11 +164,11 @@ class _Surface:
         out.mask.view(-1)[at] = True
 
     def _lit(self, points: np.ndarray, flat: np.ndarray, normal: np.ndarray, lights: Lights) -> Tensor:
-        """(K, L) bool, whether points see each light; those turned away from it do not."""
+        """(K, L) bool, whether points face each light and see it."""
         start = points + SHADOW_OFFSET * self.extent * flat
         lit = np.zeros((len(points), len(lights.directions)), bool)
         for index, direction in enumerate(lights.directions.double().numpy()):
-            # Where a flat face turns away it shades itself, however its smooth normal stands.
+            # A flat face that points away shades itself, whatever its smooth normal.
             towards = direction.astype(np.float32)
             facing = np.flatnonzero((flat @ towards > 0) & (normal @ towards > 0))
             along = np.broadcast_to(direction, (len(facing), 3))
@@ -178,13 +177,13 @@ class _Surface:
 
 
 def _mix(corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Normals (K, 3) between those at the corners (K, 3, 3)."""
+    """Normals (K, 3) interpolated between those of the corners (K, 3, 3)."""
     second, third = weights.T.astype(np.float32)
     return np.einsum("nk,nki->ni", np.stack((1 - second - third, second, third), 1), corners)
 
 
 def _towards_viewer(normal: np.ndarray, flat: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Unit normals that do not look away: at silhouettes an interpolated one may, and is laid across the ray."""
+    """Unit normals towards the viewer: an interpolated one that points away is projected across the ray."""
     away = np.maximum(row_dots(normal, along) / row_dots(along, along), 0)
     normal = normal - away[:, None] * along
     length = np.sqrt(row_dots(normal, normal))[:, None]
@@ -192,11 +191,11 @@ def _towards_viewer(normal: np.ndarray, flat: np.ndarray, along: np.ndarray) -> 
 
 
 class RayHits(NamedTuple):
-    """Where N rays first meet a triangle.
+    """The first intersections of N rays with triangles.
 
     Attributes:
-        face: (N,) int64, -1 where nothing is hit.
-        distance: (N,) float64 in multiples of the ray's direction; meaningless where nothing is hit.
+        face: (N,) int64, -1 for no hit.
+        distance: (N,) float64 in multiples of the ray's direction; undefined for no hit.
         weights: (N, 2) float64 barycentric weights of the triangle's second and third corner.
     """
 
@@ -206,7 +205,7 @@ class RayHits(NamedTuple):
 
 
 def _make_caster(vertices: np.ndarray, faces: np.ndarray, backend: str) -> EmbreeCaster | NumpyCaster:
-    """Vertices (N, 3) float64 and faces (F, 3) int64 made ready for rays; "auto" takes the first that is installed."""
+    """The ray caster of vertices (N, 3) float64 and faces (F, 3) int64; "auto" takes embree if it is installed."""
     if backend != "numpy":
         try:
             return EmbreeCaster(vertices, faces)
@@ -214,7 +213,7 @@ def _make_caster(vertices: np.ndarray, faces: np.ndarray, backend: str) -> Embre
             if backend == "embree":
                 raise BackendError(
                     'backend "embree" needs the package embreex, which has no wheel for Linux on aarch64; '
-                    'install lsmgeo[data], or take backend="numpy"'
+                    'install lsmgeo[data], or pass backend="numpy"'
                 ) from error
     return NumpyCaster(vertices, faces)
 
@@ -222,8 +221,8 @@ def _make_caster(vertices: np.ndarray, faces: np.ndarray, backend: str) -> Embre
 class EmbreeCaster:
     """Rays by embree, in float32.
 
-    The mesh is moved to the origin and scaled to unit size, and rays begin near it: neither its place and unit nor how
-    far the rays come from cost precision.
+    The mesh is moved to the origin and scaled to unit size, and rays begin near it, so that neither its position and
+    unit nor the distance of the camera costs precision.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -233,7 +232,7 @@ class EmbreeCaster:
         low, high = vertices.min(0), vertices.max(0)
         self.origin, self.scale = 0.5 * low + 0.5 * high, float((high - low).max()) or 1.0
         points = (vertices - self.origin) / self.scale
-        self.radius = 1.01 * float(np.sqrt(row_dots(points, points).max()))  # of a ball around it, with room to spare
+        self.radius = 1.01 * float(np.sqrt(row_dots(points, points).max()))  # of a ball around it, with a margin
         corners = points[faces]
         self.normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         self.heights = row_dots(self.normals, corners[:, 0])  # of the planes above the origin
@@ -242,9 +241,9 @@ class EmbreeCaster:
         TriangleMesh(self.scene, np.ascontiguousarray(points, np.float32), np.ascontiguousarray(faces, np.int32))
 
     def _scaled(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rays in the frame of the moved mesh, with origins just outside the ball around it where they were beyond.
+        """Rays in the frame of the scaled mesh, their origins moved up to the ball around it if farther away.
 
-        The last array says how far they were moved, in multiples of the directions, which keep their lengths in it.
+        The last array is the distance by which they are moved, in multiples of the directions.
         """
         along = directions / self.scale
         start = (origins - self.origin) / self.scale
@@ -254,10 +253,7 @@ class EmbreeCaster:
         return start, along, begin
 
     def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> RayHits:
-        """Where rays, origins and directions (N, 3) float64, first meet the mesh in front of their origins.
-
-        The distance is computed again in float64 with the triangle found.
-        """
+        """The first hits of rays (origins and directions (N, 3) float64); distances are recomputed in float64."""
         start, along, begin = self._scaled(origins, directions)
         found = self.scene.run(start.astype(np.float32), along.astype(np.float32), output=True)
         face, distance = found["primID"].astype(np.int64), found["tfar"].astype(np.float64)
@@ -266,13 +262,13 @@ class EmbreeCaster:
         height = self.heights[face[hit]] - row_dots(normal, start[hit])
         speed = row_dots(normal, along[hit])
         exact = np.divide(height, speed, out=np.full(len(hit), np.inf), where=speed != 0)
-        # On a triangle seen edge-on the plane says little, and embree's own distance stays.
+        # The plane of a triangle seen edge-on is imprecise: embree's distance is kept.
         size = self.radius / np.sqrt(row_dots(along[hit], along[hit]))
         distance[hit] = np.where(np.abs(exact - about) <= 1e-4 * (about + size), exact, about)
         return RayHits(face, begin + distance, np.stack((found["u"], found["v"]), 1).astype(np.float64))
 
     def occluded(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(N,) bool, whether rays meet the mesh at all in front of their origins."""
+        """(N,) bool, whether rays hit the mesh."""
         start, along, _ = self._scaled(origins, directions)
         return self.scene.run(start.astype(np.float32), along.astype(np.float32), query="OCCLUDED") >= 0
 
@@ -281,13 +277,13 @@ class NumpyCaster:
     """Rays by a tree of boxes in numpy, in float64; far slower than embree."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
-        # An empty slot (-1) is a box of NaN, which no ray meets and which adds nothing to the boxes above it.
+        # An empty slot (-1) is a box of NaN, which no ray hits and which does not extend its parents.
         self.corners = np.concatenate((vertices[faces], np.full((1, 3, 3), np.nan)))
         low, high = self.corners.min(1), self.corners.max(1)
         slots = np.full((1, LEAF << max(0, int(np.ceil(np.log2(max(len(faces), 1) / LEAF))))), -1, np.int64)
         slots[0, : len(faces)] = np.arange(len(faces))
         while slots.shape[1] > LEAF:
-            # Each box is cut at the median of its triangles, along another axis at each level; NaN sorts last.
+            # Boxes are split at the median of their triangles, along another axis at each level; NaN sorts last.
             middles = (0.5 * low + 0.5 * high)[slots, len(slots).bit_length() % 3]
             slots = np.take_along_axis(slots, np.argsort(middles, axis=1, kind="stable"), 1).reshape(2 * len(slots), -1)
         self.slots = slots
@@ -298,7 +294,7 @@ class NumpyCaster:
         self.levels = levels
 
     def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> RayHits:
-        """Where rays first meet the mesh; of triangles equally near, the first in the mesh."""
+        """The first hits of rays; of equally near triangles, the first in the mesh."""
         origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
         face = np.full(len(origins), -1, np.int64)
         best, weights = np.full(len(origins), np.inf), np.zeros((len(origins), 2))
@@ -311,7 +307,7 @@ class NumpyCaster:
                 level, rays, nodes = stack.pop()
                 low, high = self.levels[level]
                 one, two = ((side[nodes] - origins[rays]) * inverse[rays] for side in (low, high))
-                # NaN where a ray in a box's side runs along it: fmin and fmax leave that axis out.
+                # NaN if a ray runs in the side of a box: fmin and fmax ignore that axis.
                 enter = np.fmax.reduce(np.fmin(one, two), axis=1)
                 leave = np.fmin.reduce(np.fmax(one, two), axis=1)
                 margin = 1e-12 * (1.0 + np.abs(leave))
@@ -355,7 +351,7 @@ class NumpyCaster:
         weights[rays] = np.stack((u[nearest], v[nearest]), 1)
 
     def occluded(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Whether rays meet the mesh at all."""
+        """(N,) bool, whether rays hit the mesh."""
         return self.first_hits(origins, directions).face >= 0
 
 

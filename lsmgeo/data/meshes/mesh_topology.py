@@ -1,4 +1,4 @@
-"""How the faces of a mesh hang together: vertices that coincide, edges, parts, closed or not."""
+"""The topology of a mesh: coinciding vertices, edges, connected parts, and the normals at corners."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ __all__ = [
     "parts_of",
 ]
 
-# An open part counts as oriented while at most this fraction of its inner edges is not.
+# The largest fraction of inconsistent inner edges in an open part that counts as oriented.
 MISORIENTED = 0.05
 
 
 class Edges(NamedTuple):
-    """The sides of all faces, sorted so that sides on the same edge stand together.
+    """The sides of all faces, sorted so that sides on one edge are adjacent.
 
     Attributes:
         face: (3F,) the face of each side.
-        corner: (3F,) at which corner of the face the side begins, 0, 1 or 2.
+        corner: (3F,) the corner of the face where the side begins, 0, 1 or 2.
         forward: (3F,) bool, whether the side runs from the lower to the higher vertex number.
         edge: (3F,) number of the edge, ascending.
     """
@@ -49,8 +49,9 @@ class Parts(NamedTuple):
     Attributes:
         part: (F,) the part of each face.
         closed: (parts,) bool, every edge belongs to an even number of the part's faces.
-        oriented: (parts,) bool, nearly all edges of two faces are run along once each way, all of them if closed.
-        doubled: (parts,) bool, most faces have another on the same three vertices.
+        oriented: (parts,) bool, two faces at an edge run along it in opposite directions: all in a closed part, else
+            nearly all.
+        doubled: (parts,) bool, most faces have a copy on the same three vertices.
     """
 
     part: np.ndarray
@@ -60,7 +61,7 @@ class Parts(NamedTuple):
 
 
 def merged_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Faces (F, 3) by vertices merged where they coincide exactly; textures and hard edges split them in files."""
+    """Faces (F, 3) with exactly coinciding vertices merged, which files split at textures and hard edges."""
     order, new = _grouped(vertices)
     number = np.empty(len(vertices), np.int64)
     number[order] = np.cumsum(new) - 1
@@ -68,18 +69,18 @@ def merged_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def are_nondegenerate(faces: np.ndarray) -> np.ndarray:
-    """(F,) bool, whether the three vertices of a face differ."""
+    """(F,) bool, whether the three vertices of each face differ."""
     return (faces != np.roll(faces, 1, axis=1)).all(1)
 
 
 def distinct_faces(faces: np.ndarray) -> np.ndarray:
-    """Which faces to keep, (K,) ascending: one of each set of three vertices."""
+    """The faces without copies, (K,) ascending: the first on each three vertices."""
     order, new = _grouped(np.sort(faces, axis=1))
     return np.sort(order[new])
 
 
 def _grouped(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """An order (stable) that brings equal rows together, and where in it a new row begins."""
+    """A stable order in which equal rows are adjacent, and where in it a new row begins."""
     order = np.lexsort(rows.T[::-1])
     ordered = rows[order]
     new = np.ones(len(order), bool)
@@ -88,28 +89,26 @@ def _grouped(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def edges_of(faces: np.ndarray) -> Edges:
-    """The sides of all faces, those on one edge together."""
+    """The edges of faces (F, 3)."""
     start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
     order, new = _grouped(np.stack((np.minimum(start, end), np.maximum(start, end)), 1))
     return Edges(order // 3, order % 3, (start < end)[order], np.cumsum(new) - 1)
 
 
 def is_watertight(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """Whether every edge belongs to exactly two faces, coinciding vertices taken as one, faces of no area left out."""
+    """Whether every edge belongs to exactly two faces, coinciding vertices merged and faces without area left out."""
     merged = merged_faces(vertices, faces)
     merged = merged[are_nondegenerate(merged)]
     return len(merged) > 0 and bool((np.bincount(edges_of(merged).edge) == 2).all())
 
 
 def components(count: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Which group each of ``count`` things belongs to, first[i] and second[i] being in one; (count,) int64 from 0."""
+    """The connected component of each of ``count`` nodes, first[i] and second[i] linked; (count,) int64 from 0."""
     try:
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
     except ImportError as error:
-        raise BackendError(
-            "smooth normals and the parts of a mesh need the package scipy; install lsmgeo[data]"
-        ) from error
+        raise BackendError("smooth normals and the parts of a mesh need SciPy; install lsmgeo[data]") from error
     links = coo_array((np.ones(len(first), np.int8), (first, second)), shape=(count, count))
     return connected_components(links, directed=False)[1].astype(np.int64)
 
@@ -140,10 +139,10 @@ def parts_of(faces: np.ndarray) -> Parts:
 
 
 def misoriented_faces(faces: np.ndarray) -> np.ndarray:
-    """Which faces to reverse, (F,) bool, so that neighbours over edges of two faces agree, as far as that can be.
+    """The faces to reverse, (F,) bool, so that neighbours over edges of two faces agree, if possible.
 
-    Every face has two states, as it is and reversed, and each edge of two faces links the states that agree. All that
-    is linked to the first face of a group as it is stays or turns with it; on a one-sided surface nothing turns.
+    Every face has two states, unchanged and reversed, and each edge of two faces links the states that agree. Faces
+    whose unchanged state is not linked to that of their group's first face are reversed; on a one-sided surface, none.
     """
     edges = edges_of(faces)
     first = np.flatnonzero((edges.edge[1:] == edges.edge[:-1]) & (np.bincount(edges.edge)[edges.edge[1:]] == 2))
@@ -157,13 +156,13 @@ def misoriented_faces(faces: np.ndarray) -> np.ndarray:
     )
     group = components(count, one, two)
     leader = np.zeros(group.max() + 1, np.int64)
-    leader[group[::-1]] = np.arange(count)[::-1]  # the last to be written is the first face
+    leader[group[::-1]] = np.arange(count)[::-1]  # the last value written is the first face
     kept = state[:count] == state[leader[group]]
     return ~kept
 
 
 def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F, 3) unit normals; 0 for faces of no area."""
+    """(F, 3) unit normals; 0 for faces without area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
     length = np.linalg.norm(cross, axis=1, keepdims=True)
@@ -171,10 +170,10 @@ def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease: float) -> np.ndarray:
-    """Unit normals at the corners of faces, smooth but across sharp edges.
+    """Unit normals at the corners of faces, smooth except at sharp edges.
 
-    Around a vertex, the faces that follow each other over edges bent by less than ``crease`` share the mean of their
-    normals, each weighted by its angle at the vertex (Thuermer and Wuethrich, 1998).
+    Around a vertex, faces connected by edges that bend by less than ``crease`` share the mean of their normals, each
+    weighted by its angle at the vertex (Thuermer and Wuethrich, 1998).
 
     Args:
         vertices: (N, 3).
@@ -189,7 +188,7 @@ def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease: float) -> np
     begin, end = 3 * edges.face + edges.corner, 3 * edges.face + (edges.corner + 1) % 3
     least = np.cos(np.radians(crease))
     links: list[tuple[np.ndarray, np.ndarray]] = []
-    # An edge of a sheet drawn from both sides has four faces; three steps reach each from each.
+    # An edge of a two-sided sheet has four faces; three steps link all pairs of them.
     for step in range(1, 4):
         first = np.flatnonzero(edges.edge[step:] == edges.edge[:-step])
         second = first + step

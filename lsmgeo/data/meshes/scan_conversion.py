@@ -1,7 +1,7 @@
-"""Where the lines of a lattice cross triangles: the exact part of turning meshes into voxels.
+"""Where the lines of a lattice cross triangles: the exact part of voxelisation.
 
-Lattice coordinates put voxel centres at whole numbers, x, y, z in [0, n). A line runs through centres in one of 13
-directions; shearing the other two coordinates makes it parallel to an axis, and centres stay on whole numbers.
+In lattice coordinates voxel centres are at integers, x, y, z in [0, n). A line runs through centres in one of 13
+directions; a shear of the other two coordinates makes it parallel to an axis, and keeps centres at integers.
 """
 
 from __future__ import annotations
@@ -12,19 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = [
-    "LINES",
-    "Crossings",
-    "Line",
-    "cells_touched",
-    "crossing_counts",
-    "crossings",
-    "line_extent",
-]
+__all__ = ["LINES", "Crossings", "Line", "cells_touched", "crossing_counts", "crossings", "line_extent"]
 
-# Largest number of (triangle, row) or (triangle, column) pairs held at once.
+# The largest number of (triangle, row) or (triangle, column) pairs in memory at once.
 CHUNK = 1 << 19
-# Less of a normal along an axis than this cannot carry a surface past the next voxel along another axis.
+# With a smaller part of its normal along an axis, a surface cannot skip a voxel along another axis.
 SLOPE = 0.25
 
 Shape = tuple[int, int, int]
@@ -34,8 +26,8 @@ class Line(NamedTuple):
     """A family of parallel lines through the voxel centres.
 
     Attributes:
-        axis: the coordinate (0 x, 1 y, 2 z) that advances by one from centre to centre.
-        slopes: what the two other coordinates, in ascending order, gain at each step: -1, 0 or 1.
+        axis: the coordinate (0 x, 1 y, 2 z) that increases by one from centre to centre.
+        slopes: the change of the two other coordinates, in ascending order, at each step: -1, 0 or 1.
     """
 
     axis: int
@@ -43,12 +35,12 @@ class Line(NamedTuple):
 
     @property
     def others(self) -> tuple[int, int]:
-        """The two coordinates that tell the lines of the family apart, before the shear."""
+        """The two coordinates that distinguish the lines of the family, before the shear."""
         first, second = (axis for axis in range(3) if axis != self.axis)
         return first, second
 
 
-# The three axes, the six diagonals of the faces and the four of the cube: each once, both ways along it.
+# The three axes, the six diagonals of the faces and the four of the cube, each in one of its two directions.
 LINES = (
     Line(0, (0, 0)), Line(1, (0, 0)), Line(2, (0, 0)),
     Line(0, (1, 0)), Line(0, (-1, 0)), Line(0, (0, 1)), Line(0, (0, -1)), Line(1, (0, 1)), Line(1, (0, -1)),
@@ -60,11 +52,11 @@ class Crossings(NamedTuple):
     """Where lines cross triangles, in no particular order.
 
     Attributes:
-        column: (K,) which line, its first coordinate after the shear.
-        row: (K,) which line, its second coordinate after the shear.
-        place: (K,) float64 where along the line.
-        sign: (K,) int8, +1 or -1, which side of the triangle the line meets; 0 on a triangle seen edge-on.
-        face: (K,) which triangle.
+        column: (K,) the line's first coordinate after the shear.
+        row: (K,) the line's second coordinate after the shear.
+        place: (K,) float64 position along the line.
+        sign: (K,) int8, the side of the triangle that the line meets, +1 or -1; 0 for a triangle seen edge-on.
+        face: (K,) the triangle.
     """
 
     column: np.ndarray
@@ -90,17 +82,17 @@ def line_extent(shape: Shape, line: Line, index: int) -> tuple[int, int]:
 def crossings(triangles: np.ndarray, shape: Shape, line: Line) -> Iterator[Crossings]:
     """Cross every line of a family with every triangle.
 
-    A line meets a triangle when, seen along the line, an odd number of its edges pass to the right of it. An edge
-    is judged from its end points in a fixed order, so the two triangles beside an edge never both claim a line and
-    never both miss it: a line crosses a closed mesh an even number of times, through vertices and along edges too.
+    A line meets a triangle if, seen along the line, an odd number of its edges pass on its right. Edges are evaluated
+    from their end points in a fixed order, so of the two triangles at an edge exactly one meets a line through it: a
+    line crosses a closed mesh an even number of times, also through vertices and along edges.
 
     Args:
         triangles: (F, 3, 3) float64 corners in lattice coordinates, x, y, z.
         shape: number of voxels in x, y, z.
-        line: which family.
+        line: the family.
 
     Yields:
-        Crossings of some triangles at a time, all of them in the end; memory is bounded by `CHUNK`.
+        Crossings of some triangles at a time; memory is bounded by `CHUNK`.
     """
     u, v, along = sheared(triangles, line)  # (F, 3) each
     (column_low, column_high), (row_low, row_high) = (line_extent(shape, line, index) for index in (0, 1))
@@ -127,11 +119,11 @@ def crossings(triangles: np.ndarray, shape: Shape, line: Line) -> Iterator[Cross
 
 
 def crossing_counts(triangles: np.ndarray, shape: Shape, line: Line, *, signed: bool) -> np.ndarray:
-    """How many crossings each line has in front of each centre and behind the one before, signed or not.
+    """The number (or sum of signs) of the crossings of each line between each centre and the previous one.
 
     Returns:
-        (length + 1, columns, rows) int32; the last entry counts those behind every centre. A crossing exactly in a
-        centre counts as in front of it, as an edge does that a line meets exactly.
+        (length + 1, columns, rows) int32; the last entry is for crossings behind all centres. A crossing exactly at a
+        centre counts as in front of it.
     """
     (column_low, columns), (row_low, rows), length = _size(shape, line)
     counts = np.zeros((length + 1) * columns * rows, np.int32)
@@ -143,11 +135,11 @@ def crossing_counts(triangles: np.ndarray, shape: Shape, line: Line, *, signed: 
 
 
 def cells_touched(triangles: np.ndarray, shape: Shape, finer: int = 4) -> np.ndarray:
-    """Which voxels a surface passes through, seen along the axes of a lattice ``finer`` times as fine.
+    """The voxels that a surface passes through, along the axes of a lattice ``finer`` times as fine.
 
     Returns:
-        (W, H, D) uint8, 0 where no surface is; else the sum of 1, 2 and 4 for x, y and z, the axes along which a normal
-        of the surface there has a part, of `SLOPE` or more of its largest.
+        (W, H, D) uint8, 0 without a surface; else the sum of 1, 2 and 4 for the axes x, y and z along which a normal of
+        the surface has at least `SLOPE` of its largest component.
     """
     touched = np.zeros(shape, np.uint8)
     fine = (triangles + 0.5) * finer - 0.5
@@ -173,10 +165,10 @@ def _size(shape: Shape, line: Line) -> tuple[tuple[int, int], tuple[int, int], i
 
 
 def _interval(u: np.ndarray, v: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Between which u a row runs inside a triangle; (inf, -inf) where it does not."""
+    """The range of u in which a row is inside a triangle; (inf, -inf) if it is not."""
     left, right = np.full(len(row), np.inf), np.full(len(row), -np.inf)
     for i, j in ((0, 1), (1, 2), (2, 0)):
-        # From the lower end to the upper one, and by u where level: the same numbers for both triangles at an edge.
+        # From the lower end to the upper, by u if level: the same numbers for both triangles at an edge.
         swap = (v[:, i] > v[:, j]) | ((v[:, i] == v[:, j]) & (u[:, i] > u[:, j]))
         ua, ub = np.where(swap, u[:, j], u[:, i]), np.where(swap, u[:, i], u[:, j])
         va, vb = np.where(swap, v[:, j], v[:, i]), np.where(swap, v[:, i], v[:, j])
@@ -191,7 +183,7 @@ def _interval(u: np.ndarray, v: np.ndarray, row: np.ndarray) -> tuple[np.ndarray
 def _place(
     u: np.ndarray, v: np.ndarray, along: np.ndarray, normal: np.ndarray, column: np.ndarray, row: np.ndarray
 ) -> np.ndarray:
-    """Where a line meets the plane of a triangle; within the triangle's own range, which rounding could leave."""
+    """Where a line meets the plane of a triangle, clipped to the triangle's range, which rounding could exceed."""
     du, dv = column - u[:, 0], row - v[:, 0]
     second = du * (v[:, 2] - v[:, 0]) - dv * (u[:, 2] - u[:, 0])
     third = dv * (u[:, 1] - u[:, 0]) - du * (v[:, 1] - v[:, 0])
@@ -201,7 +193,7 @@ def _place(
 
 
 def _chunks(counts: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Ranges of items whose counts add up to about `CHUNK`, one item at least."""
+    """Ranges of at least one item whose counts add up to about `CHUNK`."""
     total = np.concatenate(([0], np.cumsum(counts)))
     bounds = [0]
     while bounds[-1] < len(counts):
@@ -213,7 +205,7 @@ def _chunks(counts: np.ndarray) -> Iterator[tuple[int, int]]:
 
 
 def _expand(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each index as often as its count, and which repetition it is."""
+    """Each index repeated by its count, and the number of the repetition."""
     index = np.repeat(np.arange(len(counts)), counts)
     first = np.cumsum(counts) - counts
     return index, np.arange(len(index)) - first[index]

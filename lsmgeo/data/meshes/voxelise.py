@@ -1,4 +1,4 @@
-"""Solid voxels of a mesh: exact where its parts are closed, by vote where they are not."""
+"""Solid voxels of a mesh: exact for closed parts, by vote for open ones."""
 
 from __future__ import annotations
 
@@ -26,11 +26,10 @@ __all__ = ["plan_voxels", "voxelise"]
 
 LARGEST_RESOLUTION = 512
 AXES = LINES[:3]
-# Inside-out parts beyond this many are taken as such, without asking whether they are hollows of other parts.
-MOST_HOLLOWS = 64
+# Beyond this many inside-out parts, they are reversed without a test whether they are cavities of other parts.
+MOST_CAVITIES = 64
 
 Shape = tuple[int, int, int]
-
 
 Group = tuple[np.ndarray, Sequence[Line], bool]
 
@@ -43,35 +42,34 @@ def voxelise(
     lower: float | Sequence[float] = -0.5,
     upper: float | Sequence[float] = 0.5,
 ) -> Tensor:
-    """Which voxels of a grid are solid.
+    """The voxels of a grid that are solid.
 
-    A voxel is solid when its centre is inside the mesh. Lines through the centres are crossed with all triangles in
-    float64 with a rule for edges that leaves no gap, so a closed mesh gives exactly its occupancy; nothing is random,
-    and no ray can miss or loop.
+    A voxel is solid if its centre is inside the mesh. Lines through the centres are intersected with all triangles in
+    float64, with a rule for edges that leaves no gap: a closed mesh gives exactly its occupancy, deterministically.
 
-    Each part connected through edges is treated by what it is. Of closed parts the winding number decides (the nonzero
-    rule, so parts may overlap), their faces made to agree and turned outwards first, unless they hollow out another
-    part; parity decides for closed parts that no turning makes agree. On a line whose crossings do not balance there is
-    a hole: the line abstains and the others decide, the three axes for closed parts, else 13 directions (axes,
-    diagonals of faces and of the cube). Second copies of faces that make a part visible from both sides are left out.
+    Each part, connected through edges, has its own rule. A closed part has the winding number (nonzero rule, so parts
+    may overlap) of its faces, first oriented consistently and outwards unless it is a cavity of another part; if no
+    consistent orientation exists, parity. A line whose crossings do not balance meets a hole: it abstains, and the
+    other lines vote, the three axes for closed parts, else 13 directions (axes, diagonals of faces and of the cube).
+    Copies of faces that make a part visible from both sides are left out.
 
     Args:
         mesh: (N, 3) vertices in world units and (F, 3) faces.
         resolution: voxels along each side, or (D, H, W); 512 at most.
-        keep_thin: add what is thinner than a voxel and would be lost: the voxels that the surface passes through
-            where no solid voxel is next to them, as seen along the surface's normals. By default only where the mesh is
-            not watertight: of a watertight one exactly the voxels whose centres are inside are solid, however few.
+        keep_thin: add parts thinner than a voxel: voxels that the surface passes through with no solid voxel next to
+            them along the surface's normals. By default only if the mesh is not watertight; of a watertight one exactly
+            the voxels whose centres are inside are solid.
         lower: lower bounds of the grid, world units, a number or (x, y, z).
         upper: upper bounds.
 
     Returns:
-        (D, H, W) bool, axes z, y, x; centres as in `lsmgeo.VoxelGrid`. What is outside the grid is cut off. Beside
-        the result several arrays of whole numbers of the grid's size are held.
+        (D, H, W) bool, axes z, y, x; centres as in `lsmgeo.VoxelGrid`; parts outside the grid are cut off. It takes
+        the memory of several integer arrays of the grid's size.
 
     Raises:
         DTypeError: not a `Mesh`, or arrays of other types.
         ShapeError: a wrong shape.
-        GridError: an impossible grid.
+        GridError: an invalid grid.
         OptionError: a resolution above 512, or vertices that are not finite.
         BackendError: scipy is not installed.
 
@@ -97,7 +95,7 @@ def voxelise(
         raise OptionError(f"{who}: resolution must be at most {LARGEST_RESOLUTION} voxels a side; got {shape}")
     low, high = (np.array(bound, np.float64) for bound in (grid.lower, grid.upper))
     count = (width, height, depth)
-    points = (mesh.vertices - low) / (high - low) * count - 0.5  # centres are whole numbers
+    points = (mesh.vertices - low) / (high - low) * count - 0.5  # centres are at integers
     solid = np.zeros(count, bool)
     for faces, lines, signed in plan_voxels(mesh):
         if len(faces):
@@ -108,10 +106,10 @@ def voxelise(
 
 
 def plan_voxels(mesh: Mesh) -> tuple[Group, ...]:
-    """Four groups of faces (K, 3), the lines that vote on each, and whether on the winding number, else on parity.
+    """Groups of faces (K, 3), the lines that vote on each, and whether by the winding number, else by parity.
 
-    Closed parts, their faces turned to agree and outwards; closed parts whose faces cannot be made to agree, as some
-    edges have more than two; parts with holes; parts with holes whose faces do not agree either.
+    They are: closed parts, oriented outwards; closed parts without a consistent orientation, such as with edges of more
+    than two faces; oriented parts with holes; other parts with holes.
     """
     faces = mesh.faces
     merged = merged_faces(mesh.vertices, faces)
@@ -126,9 +124,9 @@ def plan_voxels(mesh: Mesh) -> tuple[Group, ...]:
         merged, faces = merged[kept], faces[kept]
         parts = parts_of(merged)
     if (parts.closed & ~parts.oriented).any():
-        turned = (parts.closed & ~parts.oriented)[parts.part]
-        turned[turned] = misoriented_faces(merged[turned])
-        merged, faces = (np.where(turned[:, None], names[:, ::-1], names) for names in (merged, faces))
+        reversed_ = (parts.closed & ~parts.oriented)[parts.part]
+        reversed_[reversed_] = misoriented_faces(merged[reversed_])
+        merged, faces = (np.where(reversed_[:, None], names[:, ::-1], names) for names in (merged, faces))
         parts = parts_of(merged)
     closed, oriented = parts.closed[parts.part], parts.oriented[parts.part]
     outward = _outward(mesh.vertices, faces, parts)
@@ -141,7 +139,7 @@ def plan_voxels(mesh: Mesh) -> tuple[Group, ...]:
 
 
 def _outward(vertices: np.ndarray, faces: np.ndarray, parts: Parts) -> np.ndarray:
-    """Faces with the closed parts that are inside out reversed, but for those that hollow out another part."""
+    """Faces with inside-out closed parts reversed, except those that are cavities of another part."""
     corners = vertices[faces]
     low = vertices.min(0)
     a, b, c = (corners[:, k] - low for k in range(3))
@@ -154,20 +152,12 @@ def _outward(vertices: np.ndarray, faces: np.ndarray, parts: Parts) -> np.ndarra
     for rank, part in enumerate(negative[np.argsort(volume[negative], kind="stable")]):
         own = np.unique(faces[parts.part == part])
         probes = vertices[own[np.linspace(0, len(own) - 1, 4).astype(int)]]
-        reverse[part] = rank >= MOST_HOLLOWS or not bool((winding_number(probes, solid) > 0.5).all())
+        reverse[part] = rank >= MOST_CAVITIES or not bool((winding_number(probes, solid) > 0.5).all())
     return np.where(reverse[parts.part][:, None], faces[:, ::-1], faces)
 
 
 def winding_number(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """How often triangles wind around points: the solid angle that they cover, signed, over 4 pi.
-
-    Args:
-        points: (N, 3).
-        triangles: (F, 3, 3), in one frame with the points.
-
-    Returns:
-        (N,) float64.
-    """
+    """The winding numbers (N,) of triangles (F, 3, 3) around points (N, 3): signed solid angle over 4 pi."""
     result = np.zeros(len(points))
     for index, point in enumerate(points):
         a, b, c = (triangles[:, k] - point for k in range(3))
@@ -180,7 +170,7 @@ def winding_number(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _vote_inside(triangles: np.ndarray, count: Shape, lines: Sequence[Line], *, signed: bool) -> np.ndarray:
-    """(W, H, D) bool: most of the lines through a centre that cross a balanced surface say inside."""
+    """(W, H, D) bool: inside by the majority of the lines through a centre whose crossings balance."""
     votes = np.zeros(count, np.int8)
     for line in lines:
         change = crossing_counts(triangles, count, line, signed=signed)  # (length + 1, columns, rows)
@@ -197,7 +187,7 @@ def _vote_inside(triangles: np.ndarray, count: Shape, lines: Sequence[Line], *, 
 
 
 def _windows(count: Shape, line: Line) -> Iterator[tuple[int, tuple[slice, slice]]]:
-    """Which lines pass through the centres of each slab: shearing shifts a window over the columns and rows."""
+    """The lines through the centres of each slab: the shear shifts a window over the columns and rows."""
     lows = [line_extent(count, line, index)[0] for index in (0, 1)]
     columns, rows = (count[axis] for axis in line.others)
     for step in range(count[line.axis]):
@@ -206,7 +196,7 @@ def _windows(count: Shape, line: Line) -> Iterator[tuple[int, tuple[slice, slice
 
 
 def _majority(votes: np.ndarray) -> np.ndarray:
-    """Votes > 0; a tie goes with its decided neighbours, from the rim inwards."""
+    """Votes > 0; a tie takes the majority of its decided neighbours, from the border inwards."""
     sign = np.pad(np.sign(votes), 1)
     flat = sign.reshape(-1)
     open_cells = np.flatnonzero(np.pad(votes == 0, 1))
@@ -224,13 +214,13 @@ def _majority(votes: np.ndarray) -> np.ndarray:
 
 
 def _add_thin(solid: np.ndarray, touched: np.ndarray) -> np.ndarray:
-    """Add touched voxels that no solid voxel stands for.
+    """Add touched voxels whose surface no solid voxel represents.
 
-    One stands for the surface in a voxel if it is next to it along the axes of the surface's normals there: behind a
-    face, across an edge. Past the side of a rod, the next piece of the rod does not.
+    A solid voxel represents the surface in a voxel next to it along the axes of the surface's normals: behind a face,
+    across an edge. The next voxel along a rod does not.
     """
     lost = np.zeros_like(solid)
-    # A face that just grazes a voxel may have been seen in the next one only.
+    # A face that grazes a voxel may be found only in the next one.
     normals = touched
     for axis in range(3):
         normals = _dilate(normals, axis)
@@ -242,13 +232,13 @@ def _add_thin(solid: np.ndarray, touched: np.ndarray) -> np.ndarray:
         lost |= (normals == axes) & ~near
     if not lost.any():
         return solid
-    # Where a rod meets a board, both pass through one voxel, and the board stands for it: join them.
+    # Where a rod meets a board, the board represents their common voxel: join them.
     beside_lost, beside_solid = (np.any([_dilate(cells, axis) for axis in range(3)], axis=0) for cells in (lost, solid))
     return solid | lost | ((touched > 0) & beside_lost & beside_solid)
 
 
 def _dilate(cells: np.ndarray, axis: int) -> np.ndarray:
-    """Cells or-ed with their two neighbours along an axis."""
+    """Cells combined (or) with their two neighbours along an axis."""
     result = cells.copy()
     there, here = (np.moveaxis(array, axis, 0) for array in (result, cells))
     there[1:] |= here[:-1]

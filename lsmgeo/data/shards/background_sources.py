@@ -1,4 +1,4 @@
-"""What stands behind the objects of a shard's images, which hold the objects alone."""
+"""Backgrounds for the images of shards, which contain only the objects."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ __all__ = ["Background", "BackgroundError", "BackgroundSource", "make_background
 
 
 class BackgroundError(DataError):
-    """A background cannot be had, which is no fault of the shape before it."""
+    """A background cannot be read; the shape itself is not at fault."""
 
 
 BackgroundSource: TypeAlias = Callable[[np.random.Generator | None, int, int], np.ndarray]
-"""What draws a background with a generator, height and width: (3, H, W) or (3, 1, 1) float32 in [0, 1]."""
+"""Draws a background from a generator, height and width: (3, H, W) or (3, 1, 1) float32 in [0, 1]."""
 Background: TypeAlias = str | os.PathLike[str] | Sequence[float] | BackgroundSource
 
 
@@ -41,10 +41,10 @@ def _analytic(generator: np.random.Generator | None, height: int, width: int) ->
     return np.asarray(scenes.background(generator, height, width), np.float32)
 
 
-def _cutting(
+def _random_crop(
     folder: Path, names: tuple[str, ...], generator: np.random.Generator | None, height: int, width: int
 ) -> np.ndarray:
-    """A cutting of an image: any place, half to all of the largest size that fits, scaled to what is needed."""
+    """A crop of a random image, anywhere in it, half to all of the largest size that fits, resized to (H, W)."""
     from PIL import Image
 
     if generator is None:
@@ -55,21 +55,21 @@ def _cutting(
     tall, wide = (max(1, round(side * scale)) for side in (height, width))
     top = int(generator.random() * (pixels.shape[0] - tall + 1))
     left = int(generator.random() * (pixels.shape[1] - wide + 1))
-    cutting = Image.fromarray(pixels[top : top + tall, left : left + wide])
-    resized = np.asarray(cutting.resize((width, height), Image.Resampling.BILINEAR))
+    crop = Image.fromarray(pixels[top : top + tall, left : left + wide])
+    resized = np.asarray(crop.resize((width, height), Image.Resampling.BILINEAR))
     return resized.transpose(2, 0, 1).astype(np.float32) / np.float32(255)
 
 
 def make_background(background: Background) -> BackgroundSource:
-    """Make what draws backgrounds of what a caller named.
+    """Make the source of the backgrounds that an option names.
 
     Args:
         background: "white"; an RGB colour in [0, 1]; "random" for analytic ones (`lsmgeo.scenes.background`); a folder
-            of PNG or JPEG images, of which random cuttings are taken; or something that this function made before.
+            of PNG or JPEG images, for random crops of them; or the result of an earlier call.
 
     Raises:
-        OptionError: something else.
-        DataError: the folder cannot be read or holds no image.
+        OptionError: any other value.
+        DataError: the folder cannot be read or has no image.
 
     Example:
         >>> make_background("white")(None, 48, 64).ravel().tolist()
@@ -98,7 +98,7 @@ def _folder(folder: Path) -> BackgroundSource:
     try:
         names = tuple(sorted(entry.name for entry in os.scandir(folder) if entry.name.lower().endswith(SUFFIXES)))
     except (OSError, ValueError) as error:
-        raise DataError(folder, f"is no folder of backgrounds, 'white' or 'random' ({error})") from error
+        raise DataError(folder, f"is not a folder of backgrounds, 'white' or 'random' ({error})") from error
     if not names:
         raise DataError(folder, "holds no PNG or JPEG image")
-    return partial(_cutting, folder, names)
+    return partial(_random_crop, folder, names)

@@ -1,6 +1,6 @@
-"""Feeding a training run from shards: which shapes, in which order, with which of their views.
+"""Shapes for a training run: which of them, in which order, with which of their views.
 
-Every random choice comes from ``SeedSequence([seed, epoch, index])``, never from a state that advances: the samples are
+Every random choice comes from ``SeedSequence([seed, epoch, index])``, not from a state that advances: the samples are
 the same for any number of workers, and a run resumes from three integers (epoch, position, seed).
 """
 
@@ -22,39 +22,38 @@ from lsmgeo.errors import DataError, OptionError
 
 __all__ = ["EpochSampler", "ShapeDataset"]
 
-SUBSTITUTES = 16  # shapes tried in a bad one's place
+SUBSTITUTES = 16  # shapes tried in place of a bad one
 
 
 class ShapeDataset(Dataset[Sample]):
-    """The shapes of shards as a map-style data set, each time with other views.
+    """The shapes of shards as a map-style data set, with other views in each epoch.
 
-    An item is ``dataset[(epoch, index)]``, which is what `EpochSampler` asks for; ``dataset[index]`` is of epoch 0. It
-    depends on seed, epoch and index alone.
+    An item is ``dataset[(epoch, index)]``, the pair that `EpochSampler` yields; ``dataset[index]`` is of epoch 0. It
+    depends only on seed, epoch and index.
 
-    A shape that cannot be read raises a `DataError` that names its shard (through a loader's worker a ``RuntimeError``
-    with its text). With ``on_error="skip"`` another shape stands in for it, drawn by a hash of seed, epoch and index;
-    a line goes to `bad_samples`, and where more than `max_bad_fraction` of the data set is bad, the error is raised
-    after all. Each process counts the different bad shapes that it met itself: with W workers the limit may be passed
-    up to W times over before one of them stops. An image of the folder of backgrounds that cannot be used is no fault
-    of a shape and raises in any case.
+    A shape that cannot be read raises a `DataError` that names its shard (in a loader's worker a ``RuntimeError`` with
+    its text). With ``on_error="skip"`` another shape replaces it, drawn by a hash of seed, epoch and index, and a line
+    is added to `bad_samples`; if more than `max_bad_fraction` of the data set is bad, the error is raised. Each process
+    counts only the bad shapes that it met: with W workers up to W times as many may be bad. A background image that
+    cannot be used always raises.
 
     Args:
         shards: the shapes.
         views: how many different views of a shape, in random order; (low, high) for a random number of them, both
             included; None for all in order.
-        seed: what views and backgrounds are drawn from, at least 0.
+        seed: of views and backgrounds, at least 0.
         depth: whether to read depth.
         occupancy: the resolution of the occupancy to read, or None for none.
         background: see `ShardSet.read`.
-        categories: keep the shapes of these categories only.
-        split: keep the shapes of this split only.
-        on_error: "raise" or "skip"; skip in training only, since it changes what an evaluation averages over.
-        max_bad_fraction: the share of bad shapes that "skip" puts up with.
-        bad_samples: the file of JSON lines that "skip" appends to; by default ``bad_samples.jsonl`` beside the shards.
+        categories: use only shapes of these categories.
+        split: use only shapes of this split.
+        on_error: "raise" or "skip"; "skip" is for training, since it changes the shapes that an evaluation averages.
+        max_bad_fraction: the largest fraction of bad shapes with "skip".
+        bad_samples: the file of JSON lines for "skip"; by default ``bad_samples.jsonl`` beside the shards.
 
     Raises:
-        OptionError: an option that is none, or no shape is left.
-        DataError: a shape has fewer views than asked for, or the folder of backgrounds cannot be read.
+        OptionError: an invalid option, or no shape is left.
+        DataError: a shape has too few views, or the folder of backgrounds cannot be read.
 
     Example:
         >>> import tempfile, torch
@@ -120,7 +119,7 @@ class ShapeDataset(Dataset[Sample]):
             raise OptionError(f"ShapeDataset: an item is an index or (epoch, index); got {describe(item)}")
         epoch, index = pair
         if not is_whole(index) or not 0 <= index < len(self):
-            if is_whole(index):  # what tells Python's own iteration where to stop
+            if is_whole(index):  # ends Python's iteration over the data set
                 raise IndexError(f"ShapeDataset: index must be from 0 to {len(self) - 1}; got {index}")
             raise OptionError(f"ShapeDataset: an item is an index or (epoch, index); got {describe(item)}")
         epoch, index = check_whole("ShapeDataset", "epoch", epoch, 0), int(index)
@@ -144,7 +143,7 @@ class ShapeDataset(Dataset[Sample]):
         generator = np.random.default_rng(np.random.SeedSequence([self.seed, epoch, index, attempt]))
         chosen = None
         if self.views is not None:
-            # Uniform numbers alone are drawn: what else numpy makes of a seed may differ between its versions.
+            # Only uniform numbers are drawn: other distributions may differ between versions of numpy.
             low, high = self.views
             count = low + int(generator.random() * (high - low + 1))
             order = np.argsort(generator.random(int(self.shards.view_counts[shape])), kind="stable")
@@ -159,13 +158,13 @@ class ShapeDataset(Dataset[Sample]):
         )
 
     def _report(self, epoch: int, index: int, error: DataError) -> None:
-        """Note a bad shape, once a process, and stop at too many."""
+        """Note a bad shape, once in each process; too many raise."""
         if index not in self._bad:
             self._bad.add(index)
             name = self.shards.names[int(self.indices[index])]
             line = {"name": name, "index": index, "epoch": epoch, "path": str(error.path), "reason": error.reason}
             try:
-                # One short line in one call: lines of several processes do not mix.
+                # One short line in one call, so that lines of several processes do not mix.
                 with self.bad_samples.open("ab", buffering=0) as stream:
                     stream.write(json.dumps(line).encode() + b"\n")
             except OSError as cause:
@@ -179,27 +178,26 @@ class ShapeDataset(Dataset[Sample]):
 
 
 class EpochSampler(Sampler[tuple[int, int]]):
-    """The order of a data set's items, another for each epoch, from any position on; yields (epoch, index).
+    """The order of a data set's items, different in each epoch, from any position on; yields (epoch, index).
 
-    The order of an epoch follows from seed and epoch. `position` counts the samples of this epoch that all ranks
-    together have consumed, so that a run resumed at a position sees exactly what the uninterrupted run would have seen
-    from there, also with another number of workers or, in batches of other ranks, of processes. Workers fetch ahead of
-    the training loop: the loop counts, and sets the position; the sampler cannot know it.
+    The order follows from seed and epoch. `position` counts the samples of this epoch that all ranks together have
+    consumed: a run resumed at a position sees the samples that an uninterrupted run would have seen, also with another
+    number of workers or processes. Workers prefetch, so the training loop counts and sets the position.
 
-    All ranks get equally many samples: where the rest of an epoch does not divide, its first are repeated at the end
-    (at most ``world_size - 1`` of them); a set that must be seen exactly once is read by one rank.
+    All ranks get equally many samples: if the rest of an epoch does not divide, its first samples are repeated at the
+    end (at most ``world_size - 1`` of them). A set that must be read exactly once is read by one rank.
 
     Args:
         length: the number of items.
-        seed: what the orders are drawn from, at least 0.
+        seed: of the orders, at least 0.
         epoch: at least 0.
-        position: where in the epoch to begin; at the end, or beyond, the epoch is empty.
-        rank: which process this is.
-        world_size: of how many.
+        position: the first sample of the epoch; at its end or beyond, the epoch is empty.
+        rank: of this process.
+        world_size: the number of processes.
         shuffle: False for 0, 1, 2, ... in every epoch.
 
     Raises:
-        OptionError: an option that is none.
+        OptionError: an invalid option.
 
     Example:
         >>> sampler = EpochSampler(5, seed=0, shuffle=False, rank=1, world_size=2)
@@ -230,11 +228,11 @@ class EpochSampler(Sampler[tuple[int, int]]):
         self.load_state_dict({"epoch": epoch, "position": position, "seed": seed})
 
     def set_epoch(self, epoch: int, position: int = 0) -> None:
-        """Go to a position of an epoch, its beginning by default; it counts from the next iteration on.
+        """Set the epoch and the position at which the next iteration begins.
 
         Args:
             epoch: at least 0.
-            position: samples of it that all ranks together have consumed.
+            position: samples of the epoch that all ranks together have consumed.
         """
         self.epoch = check_whole("EpochSampler", "epoch", epoch, 0)
         self.position = check_whole("EpochSampler", "position", position, 0)
@@ -244,23 +242,15 @@ class EpochSampler(Sampler[tuple[int, int]]):
         return {"epoch": self.epoch, "position": self.position, "seed": self.seed}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Go where a state says; length, rank and world size stay.
-
-        Raises:
-            OptionError: a value that is no whole number, at least 0.
-        """
+        """Restore a state; length, rank and world size are unchanged. An OptionError for an invalid number."""
         self.seed = check_whole("EpochSampler", "seed", state["seed"], 0)
         self.set_epoch(state["epoch"], state["position"])
 
     def order(self, epoch: int) -> np.ndarray:
-        """All indices in the order of an epoch, (length,) int64.
-
-        Args:
-            epoch: at least 0.
-        """
+        """All indices in the order of an epoch, (length,) int64."""
         if not self.shuffle:
             return np.arange(self.length)
-        # The sorting of uniform numbers is the same in all versions of numpy; its permutations need not be.
+        # Sorting uniform numbers gives the same order in all versions of numpy; its permutations may not.
         epoch = check_whole("EpochSampler", "epoch", epoch, 0)
         generator = np.random.default_rng(np.random.SeedSequence([self.seed, epoch]))
         return np.argsort(generator.random(self.length), kind="stable")
@@ -289,7 +279,7 @@ def _view_range(views: int | tuple[int, int] | None) -> tuple[int, int] | None:
 
 
 def _filtered(shards: ShapeSet, categories: Collection[str] | None, split: str | None) -> np.ndarray:
-    """The indices of the shapes that are wanted, ascending."""
+    """The indices of the selected shapes, ascending."""
     wanted = np.ones(len(shards), bool)
     if isinstance(categories, str):
         categories = (categories,)
@@ -304,5 +294,5 @@ def _filtered(shards: ShapeSet, categories: Collection[str] | None, split: str |
                 raise OptionError(f"ShapeDataset: {field}: no shape is of {missing}; the shards have {there}")
             wanted &= np.array([value in keep for value in have])
     if not wanted.any():
-        raise OptionError(f"ShapeDataset: no shape is of categories {categories} and split {split!r} at once")
+        raise OptionError(f"ShapeDataset: no shape is of categories {categories} and split {split!r}")
     return np.flatnonzero(wanted)

@@ -1,4 +1,4 @@
-"""Random access to shards: of one shape only the members that are asked for are read."""
+"""Random access to shards: only the requested members of a shape are read."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from lsmgeo.errors import DataError, OptionError
 __all__ = ["ShardSet"]
 
 OPEN_FILES = 128
-# Of all images of one call. Flat images pack a thousandfold: small tars may hold more than any memory does.
+# Of all images of one call: images of one colour compress a thousandfold, so a small tar may exceed all memory.
 MAX_PIXELS_AT_ONCE = 1 << 28
 
 
 class ShardSet:
     """The shapes of all shards (``*.tar``) of a folder, in the order of their names.
 
-    The headers of the tars, and the check sums of the sidecars that are there, are read once, at opening. Files are
-    opened when they are first read and at no common position, so the set may be used from several threads, and in
-    processes forked from this one or sent it by pickle.
+    The headers of the tars and the check sums of existing sidecars are read once, when the set is opened. Files are
+    opened when first read, and reads share no file position, so the set may be used from several threads, in forked
+    processes, and through pickle.
 
     Args:
-        folder: where the shards lie.
+        folder: of the shards.
 
     Raises:
-        DataError: no such folder, no shard in it, a damaged one, or a name that two shapes have.
+        DataError: no such folder, no shard in it, a damaged one, or two shapes of one name.
 
     Attributes:
         folder: as given.
         names: of the N shapes.
-        categories: of the shapes, None where one has none.
-        splits: of the shapes, likewise.
-        view_counts: (N,) how many views each has.
+        categories: of the shapes, or None.
+        splits: of the shapes, or None.
+        view_counts: (N,) number of views of each shape.
 
     Example:
         >>> import tempfile, torch
@@ -65,7 +65,7 @@ class ShardSet:
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
         try:
-            names = sorted(entry.name for entry in os.scandir(self.folder) if _is_shard(entry.name))
+            names = sorted(name for name in os.listdir(self.folder) if name.endswith(".tar") and name[0] != ".")
         except (OSError, ValueError) as error:
             raise DataError(folder, f"cannot be read ({error})") from error
         if not names:
@@ -93,23 +93,18 @@ class ShardSet:
         return {**self.__dict__, "_open": {}}
 
     def _locate(self, index: int) -> tuple[ShardIndex, int]:
-        """The shard of a shape, and its row in that."""
+        """The shard of a shape, and its row in the shard."""
         if not is_whole(index) or not 0 <= index < len(self):
             raise OptionError(f"ShardSet: index must be an integer from 0 to {len(self) - 1}; got {describe(index)}")
         number = bisect_right(self._ends, int(index))
         return self._shards[number], int(index) - (self._ends[number - 1] if number else 0)
 
     def path(self, index: int) -> Path:
-        """The tar file that holds a shape."""
+        """The tar file of a shape."""
         return self._locate(index)[0].path
 
     def metadata(self, index: int) -> Metadata:
-        """What the json of a shape says.
-
-        Raises:
-            OptionError: no such shape.
-            DataError: it is damaged.
-        """
+        """The content of a shape's json; an OptionError for an index out of range, a DataError if it is damaged."""
         shard, row = self._locate(index)
         metadata = decode_metadata(self._fetch(shard, row, "json"), shard.keys[row], shard.path)
         if metadata.name != shard.names[row]:
@@ -132,21 +127,21 @@ class ShardSet:
         """Read a shape, or some views of it.
 
         Args:
-            index: which shape.
-            views: which views and in which order; None for all.
+            index: of the shape.
+            views: of the shape, in this order; None for all.
             depth: whether to read depth.
             occupancy: the resolution of the occupancy to read, or None for none.
-            background: what stands behind the object: "white", an RGB colour in [0, 1], "random" or a folder of
-                images; the last two draw another for each view.
-            generator: what they are drawn with.
+            background: "white", an RGB colour in [0, 1], "random" or a folder of images; the last two are drawn anew
+                for each view.
+            generator: of random backgrounds.
 
         Returns:
             The sample: float32 cameras, the mask where the images' alpha is above 127.
 
         Raises:
-            OptionError: no such shape or view, or an option that is none.
-            DataError: what is asked for is not in the shard, it is damaged, it is more than 2^28 pixels at once (views
-                times height times width), or an image of the folder of backgrounds cannot be used.
+            OptionError: an index or a view out of range, or an invalid option.
+            DataError: the shard lacks the depth or occupancy, is damaged, or has more than 2^28 pixels in these views;
+                or an image of the folder of backgrounds cannot be used.
         """
         shard, row = self._locate(index)
         key, metadata = shard.keys[row], self.metadata(index)
@@ -157,9 +152,9 @@ class ShardSet:
             raise DataError(
                 shard.path,
                 f"{key}: {len(chosen)} views of {height} x {width} are more than the "
-                f"{MAX_PIXELS_AT_ONCE} pixels that are read at once; read fewer views",
+                f"{MAX_PIXELS_AT_ONCE} pixels that one call may read; read fewer views",
             )
-        # All are read before anything of their size is made: what a damaged json claims is made by nobody.
+        # Images are decoded before arrays of their size are allocated, since a damaged json may state any size.
         rgba = [self._read_png(shard, row, f"{view:02d}.png", RGBA, metadata) for view in chosen]
         images = np.empty((len(chosen), 3, *metadata.size), np.float32)
         masks = np.empty((len(chosen), *metadata.size), np.bool_)
@@ -177,8 +172,8 @@ class ShardSet:
             depths = torch.from_numpy(np.stack(steps).astype(np.float32) * np.float32(metadata.depth_step))
         if occupancy is not None:
             if occupancy not in metadata.voxels or isinstance(occupancy, bool):
-                there = ", ".join(map(str, metadata.voxels)) or "none"
-                raise DataError(shard.path, f"{key} has no occupancy of {describe(occupancy)} voxels; it has {there}")
+                stored = ", ".join(map(str, metadata.voxels)) or "none"
+                raise DataError(shard.path, f"{key} has no occupancy of {describe(occupancy)} voxels; it has {stored}")
             content = self._fetch(shard, row, f"vox{occupancy}.npy")
             grid = torch.from_numpy(decode_occupancy(content, occupancy, shard.path, f"{key}.vox{occupancy}.npy"))
         return Sample(
@@ -199,14 +194,10 @@ class ShardSet:
     def _fetch(self, shard: ShardIndex, row: int, suffix: str) -> bytes:
         tar = self._open.get(shard.path)
         if tar is None:
-            if len(self._open) >= OPEN_FILES:  # a file closes when its last reader lets go of it
+            if len(self._open) >= OPEN_FILES:  # a file is closed after its last reader
                 self._open.clear()
             tar = self._open[shard.path] = ShardFile(shard.path, shard.size)
         return shard.read(tar, row, suffix)
-
-
-def _is_shard(name: str) -> bool:
-    return name.endswith(".tar") and not name.startswith(".")
 
 
 def _views(views: Sequence[int] | None, there: int) -> Sequence[int]:

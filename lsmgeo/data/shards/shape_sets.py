@@ -1,4 +1,4 @@
-"""Sets of shapes that training and evaluation read: shards, or synthetic-13, rendered when it is needed."""
+"""The sets of shapes that training and evaluation read: shards, or synthetic-13, rendered when read."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ __all__ = [
     "synthetic_numbers",
 ]
 
-# A set of so many shapes is gone through again and again: its shapes are kept.
+# Sets of at most so many shapes are read many times, so their shapes are kept.
 MOST_KEPT = 1000
 
 
 class ShapeSpec(NamedTuple):
-    """A synthetic shape with the views of it that are wanted, before anything of it is rendered."""
+    """A synthetic shape and its views, before rendering."""
 
     shape: synthetic13.SyntheticShape
     cameras: CameraTensors  # (V,) float64
-    model_cameras: CameraTensors  # the cameras that the model gets, which pose noise may have moved
+    model_cameras: CameraTensors  # the input of the model, possibly with pose noise
     backgrounds: Tensor  # (V, 3, H, W) or (V, 3, 1, 1)
     occupancy: Tensor | None
 
@@ -48,12 +48,12 @@ class ShapeSpec(NamedTuple):
 def render_shapes(
     specs: Sequence[ShapeSpec], *, depth: bool, device: torch.device | None = None, shadows: bool = False
 ) -> list[Sample]:
-    """Render shapes together, with the cameras that the model is told.
+    """Render shapes in one call; the samples have the cameras of the model.
 
     Args:
         specs: at least one; images of one size.
         depth: whether depth is kept.
-        device: what renders; by default the CPU.
+        device: of the rendering; by default the CPU.
         shadows: whether shapes cast shadows on themselves.
     """
     device = torch.device("cpu") if device is None else device
@@ -62,7 +62,7 @@ def render_shapes(
     rendering = scenes.render(
         [spec.shape.scene for spec in specs],
         CameraTensors(*(pad_with_first([*map(torch.as_tensor, values)]).to(device) for values in cameras)),
-        Lights(  # dark ones where a shape has fewer
+        Lights(  # padded with black lights
             pad_with_first([light.directions for light in lights]),
             pad_with_zeros([light.colours for light in lights]),
             torch.stack([light.ambient for light in lights]),
@@ -86,14 +86,13 @@ def render_shapes(
 
 
 def render_batch(specs: Sequence[ShapeSpec], *, depth: bool, device: torch.device, at_once: bool) -> Batch:
-    """Make a batch of described shapes.
+    """Render shapes as a batch.
 
     Args:
         specs: the shapes.
         depth: whether depth is kept.
-        device: what renders.
-        at_once: whether all views are rendered in one call, as suits a GPU; a CPU renders them one by one in any case,
-            and then none to be thrown away.
+        device: of the rendering.
+        at_once: whether all shapes are rendered in one call, which suits a GPU; one by one, no padding is rendered.
     """
     groups = [specs] if at_once else [[spec] for spec in specs]
     return collate([_single(sample) for some in groups for sample in render_shapes(some, depth=depth, device=device)])
@@ -105,13 +104,13 @@ def _single(sample: Sample) -> Sample:
 
 @dataclass(eq=False)
 class SyntheticSet:
-    """Shapes of synthetic-13 as a `ShardSet` gives those of shards, rendered when they are read.
+    """Shapes of synthetic-13 with the interface of `ShardSet`, rendered when read.
 
     Attributes:
         numbers: of the shapes in the set, see `synthetic_numbers`.
         size: height and width of the images in pixels.
-        seed: which set.
-        pool: how many views of a shape there are, as many as `lsmgeo render` makes by default.
+        seed: of the set.
+        pool: the number of views of a shape, by default that of `lsmgeo render`.
         is_rendered: whether a shape is read as a `Sample`; else as a `ShapeSpec`, for `render_batch`.
     """
 
@@ -167,14 +166,7 @@ ShapeSet: TypeAlias = ShardSet | SyntheticSet
 
 
 def describe_shape(seed: int, number: int, views: int, size: int) -> ShapeSpec:
-    """A shape of synthetic-13 with all its views, on white and without voxels.
-
-    Args:
-        seed: which set.
-        number: of the shape in it.
-        views: how many.
-        size: height and width of the images in pixels.
-    """
+    """A shape of synthetic-13, by the set's seed and its number, with all its views, on white and without voxels."""
     cameras = synthetic13.views(seed, number, views, size)
     return ShapeSpec(synthetic13.shape(seed, number), cameras, cameras, torch.ones(views, 3, 1, 1), None)
 
@@ -184,15 +176,10 @@ def _category_of(number: int) -> str:
 
 
 def synthetic_numbers(split: str, categories: Sequence[str] | None = None, seed: int = 0) -> Iterator[int]:
-    """The numbers of the shapes of synthetic-13 that are of a split and of some categories, ascending without end.
-
-    Args:
-        split: the part of the set.
-        categories: names, or None for all.
-        seed: which set.
+    """The numbers of the shapes of a split and of some categories (None for all) of synthetic-13, ascending, endless.
 
     Raises:
-        OptionError: a split or a category that there is not.
+        OptionError: an unknown split or category.
     """
     check_choice("synthetic-13", "split", split, ("train", "val", "test"))
     names = tuple(synthetic13.CATEGORIES)

@@ -1,4 +1,4 @@
-"""What a set of shards is made from: shapes of synthetic-13 by number, or files below a folder; all can be pickled."""
+"""Sources of the shapes of a set: synthetic-13, or the files below a folder. All can be pickled."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ __all__ = [
     "FileSource",
     "MeshFolder",
     "Recipe",
-    "Rendered",
+    "RenderedShape",
     "Source",
     "Synthetic13",
     "open_source",
-    "rendered",
+    "rendered_shape",
     "sort_paths",
     "split_by_name",
     "walk",
 ]
 
-# Raised when a change of the generators or of the renderer changes what a seed gives.
+# Increased by a change of the generators or of the renderer that changes the shapes of a seed.
 VERSION = 1
 MESH_SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
 MAX_PATHS = 1_000_000
-# The last number of the seed that a mesh's lights are drawn from.
+# The last number of the seed of a mesh's lights.
 LIGHTS = 2
 
 
 class Recipe(NamedTuple):
-    """How shapes are turned into views and voxels.
+    """The settings of the views and voxels of a set.
 
     Attributes:
-        seed: decides shapes, lights and views.
+        seed: of shapes, lights and views.
         views: number of views of a shape.
         size: height and width of the images in pixels.
         voxels: resolutions of the occupancy grids.
@@ -65,8 +65,8 @@ class Recipe(NamedTuple):
     shadows: bool = False
 
 
-class Rendered(NamedTuple):
-    """A shape as it goes into a shard."""
+class RenderedShape(NamedTuple):
+    """A shape as it is written into a shard."""
 
     sample: Sample  # with the first of the occupancy grids
     more_occupancy: tuple[Tensor, ...]
@@ -84,7 +84,7 @@ class Synthetic13:
         return self.count
 
     def part(self, start: int, stop: int) -> Self:
-        """Itself: a shape is made from its number."""
+        """Itself, since a shape is made from its number."""
         return self
 
     def identity(self) -> Any:
@@ -92,31 +92,31 @@ class Synthetic13:
         return VERSION
 
     def file(self, index: int) -> str:
-        """Its number."""
+        """The shape's number."""
         return f"shape {index}"
 
-    def render(self, index: int, recipe: Recipe) -> Rendered:
+    def render(self, index: int, recipe: Recipe) -> RenderedShape:
         """Views and voxels of one synthetic shape, exact."""
         spec = describe_shape(recipe.seed, index, recipe.views, recipe.size)
         sample = render_shapes([spec], depth=recipe.depth, shadows=recipe.shadows)[0]
         grids = [scenes.voxels([spec.shape.scene], resolution)[0] for resolution in recipe.voxels]
-        return rendered(sample, grids, synthetic13.split(recipe.seed, index))
+        return rendered_shape(sample, grids, synthetic13.split(recipe.seed, index))
 
 
-def rendered(sample: Sample, grids: Sequence[Tensor], split: str) -> Rendered:
+def rendered_shape(sample: Sample, grids: Sequence[Tensor], split: str) -> RenderedShape:
     """A shape with its occupancy grids."""
-    return Rendered(sample._replace(occupancy=grids[0] if grids else None), tuple(grids[1:]), split)
+    return RenderedShape(sample._replace(occupancy=grids[0] if grids else None), tuple(grids[1:]), split)
 
 
 @dataclass(frozen=True)
 class FileSource(ABC):
-    """Shapes that are made from files below a folder, in the order of their paths.
+    """Shapes made from files below a folder, in the order of their paths.
 
     Attributes:
         root: the folder.
         paths: of the shapes, relative to the root, with forward slashes.
-        name: what its shards are called.
-        first: the number of the first.
+        name: of the shards.
+        first: the number of the first shape.
     """
 
     root: Path
@@ -128,11 +128,11 @@ class FileSource(ABC):
         return len(self.paths)
 
     def part(self, start: int, stop: int) -> Self:
-        """These shapes alone, which keep their numbers: a task need not carry the paths of a whole tree."""
+        """Only these shapes, with their numbers, so that a task does not hold the paths of all."""
         return replace(self, paths=self.paths[start - self.first : stop - self.first], first=start)
 
     def file(self, index: int) -> str:
-        """Its path."""
+        """The shape's path."""
         return str(self.root / self.paths[index - self.first])
 
     def digests(self, path: str) -> list[tuple[str, str]]:
@@ -146,48 +146,43 @@ class FileSource(ABC):
         except OSError as error:
             return [("", f"cannot be read ({error})")]
 
-    def render(self, index: int, recipe: Recipe) -> Rendered:
-        """Views and voxels of one shape.
-
-        Raises:
-            DataError: its files cannot be used.
-        """
+    def render(self, index: int, recipe: Recipe) -> RenderedShape:
+        """Views and voxels of one shape; a DataError if its files cannot be used."""
         try:
             return self._render(index, recipe)
         except DataError:
             raise
-        except LsmGeoError as error:  # what only shows when it is used: no extent, colours out of range
+        except LsmGeoError as error:  # found only in use: no extent, colours out of range
             raise DataError(self.file(index), str(error)) from error
 
     @abstractmethod
     def identity(self) -> Any:
-        """What the shapes depend on besides the recipe, as JSON can hold it."""
+        """All that the shapes depend on besides the recipe, as JSON values."""
 
     @abstractmethod
     def _files(self, path: Path) -> list[Path]:
-        """What a shape is made from, in order."""
+        """The files of a shape, in order."""
 
     @abstractmethod
-    def _render(self, index: int, recipe: Recipe) -> Rendered:
+    def _render(self, index: int, recipe: Recipe) -> RenderedShape:
         """Views and voxels of one shape."""
 
 
 class MeshFolder(FileSource):
-    """The meshes below a folder.
+    """The meshes below a folder, centred and scaled so that the diagonal of their bounding box is 1.
 
-    The first folder below the root names the category; a ShapeNet synset is spelt out. Meshes are centred, and scaled
-    so that the diagonal of the box around them is 1.
+    The category is the first folder below the root, for a ShapeNet synset its name.
     """
 
     def identity(self) -> Any:
-        """SHA-256 of the files and of the material files beside them, and what casts the rays."""
-        caster = "embree" if find_spec("embreex") else "numpy"  # what render_mesh takes
-        return [VERSION, caster, [[path, *(digest for _, digest in self.digests(path))] for path in self.paths]]
+        """SHA-256 of the files and of the material files beside them, and the renderer's backend."""
+        backend = "embree" if find_spec("embreex") else "numpy"  # the choice of render_mesh
+        return [VERSION, backend, [[path, *(digest for _, digest in self.digests(path))] for path in self.paths]]
 
     def _files(self, path: Path) -> list[Path]:
         return [path, *(sorted(path.parent.glob("*.mtl")) if path.suffix.lower() == ".obj" else [])]
 
-    def _render(self, index: int, recipe: Recipe) -> Rendered:
+    def _render(self, index: int, recipe: Recipe) -> RenderedShape:
         from lsmgeo.data.meshes import load_mesh, normalise
         from lsmgeo.data.meshes.mesh_rendering import render_mesh
         from lsmgeo.data.meshes.voxelise import voxelise
@@ -198,12 +193,12 @@ class MeshFolder(FileSource):
         lights = synthetic13.random_lights(np.random.default_rng([recipe.seed, index, LIGHTS]))
         rendering = render_mesh(mesh, cameras, lights, shadows=recipe.shadows)
         if not rendering.mask.any():
-            raise DataError(self.root / file, "is seen in none of the views")
-        # A lampshade or a sail has hardly a voxel whose centre it holds.
+            raise DataError(self.root / file, "is visible in none of its views")
+        # Thin objects, such as lampshades and sails, contain hardly any voxel centres.
         grids = [voxelise(mesh, resolution, keep_thin=True) for resolution in recipe.voxels]
         depth = rendering.depth if recipe.depth else None
         sample = Sample(rendering.images, cameras, depth, rendering.mask, None, file, _category(file), file)
-        return rendered(sample, grids, split_by_name(file))
+        return rendered_shape(sample, grids, split_by_name(file))
 
 
 def _category(file: str) -> str | None:
@@ -215,7 +210,7 @@ Source: TypeAlias = Synthetic13 | FileSource
 
 
 def split_by_name(name: str) -> str:
-    """The part of a set that a name belongs to, 0.7 / 0.1 / 0.2 in expectation, whatever else the set holds.
+    """The split (train 0.7, val 0.1, test 0.2) of a shape, by a hash of its name.
 
     Example:
         >>> split_by_name("03001627/1a6f615e8b1b5ae4dbbc9440457e303e/models/model_normalized.obj")
@@ -226,25 +221,25 @@ def split_by_name(name: str) -> str:
 
 
 def open_source(source: str | Path, shapes: int | None = None) -> Source:
-    """Open what shapes are made from.
+    """Open a source of shapes.
 
     Args:
         source: "synthetic-13", or a folder of meshes (a ShapeNetCore tree, or any other).
-        shapes: number of shapes; of a folder at most so many, all by default.
+        shapes: the number of shapes, of a folder the largest number; all of a folder by default.
 
     Raises:
         OptionError: no number of shapes for synthetic-13, or fewer than one.
-        DataError: the folder cannot be read or holds no mesh.
+        DataError: the folder cannot be read or has no mesh.
     """
     if shapes is not None:
         shapes = check_whole("render_set", "shapes", shapes, 1, 10**8)
     if str(source) == "synthetic-13":
         if shapes is None:
-            raise OptionError("render_set: shapes must be given for synthetic-13, which has no end; got None")
+            raise OptionError("render_set: shapes must be given for synthetic-13, which is endless; got None")
         return Synthetic13(shapes)
     root = Path(source)
     if not root.is_dir():
-        raise DataError(root, "is no folder of meshes, and not 'synthetic-13'")
+        raise DataError(root, "is neither a folder of meshes nor 'synthetic-13'")
     root = root.resolve()
     meshes = (folder / name for folder, names in walk(root) for name in names if name.lower().endswith(MESH_SUFFIXES))
     found = sort_paths(root, (file for file in meshes if not file.is_symlink()), f"mesh ({', '.join(MESH_SUFFIXES)})")
@@ -255,11 +250,7 @@ def open_source(source: str | Path, shapes: int | None = None) -> Source:
 
 
 def walk(root: Path) -> Iterator[tuple[Path, list[str]]]:
-    """The folders below a folder and the names of their files; links to folders are not followed.
-
-    Raises:
-        DataError: a folder cannot be read.
-    """
+    """The folders below a folder, not through links, and their files' names; a DataError if one cannot be read."""
 
     def refuse(error: OSError) -> None:
         raise DataError(error.filename or root, f"cannot be read ({error})") from error
@@ -269,11 +260,7 @@ def walk(root: Path) -> Iterator[tuple[Path, list[str]]]:
 
 
 def sort_paths(root: Path, paths: Iterable[Path], what: str) -> tuple[str, ...]:
-    """Paths below a folder, relative to it and with forward slashes, in order.
-
-    Raises:
-        DataError: there is none, or too many.
-    """
+    """Paths relative to a folder, with forward slashes, in order; a DataError if there are none or too many."""
     found = tuple(sorted(path.relative_to(root).as_posix() for path in paths))
     if not 1 <= len(found) <= MAX_PATHS:
         raise DataError(root, f"holds {len(found) or 'no'} {what}; 1 to {MAX_PATHS} are expected")

@@ -1,4 +1,4 @@
-"""What happens to a shape before a model sees it: another size of images, noise in its poses."""
+"""Transforms of shapes before a model gets them: resized images, pose noise."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from lsmgeo.data.shards.shape_sets import ShapeSpec
 
 __all__ = ["TransformedShapes", "perturb_cameras", "resize_sample", "resize_views"]
 
-# The last number of the seed that pose noise is drawn from, unlike any number of another draw.
+# The last number of the seed of pose noise, different from all others.
 NOISE = 0x706F7365
 
 
 class TransformedShapes(Dataset[Sample | ShapeSpec]):
-    """The first shapes of a data set at the size of the model's images, the cameras that it is told turned by noise."""
+    """The first shapes of a data set, at the size of the model's images and with pose noise in its cameras."""
 
     def __init__(self, dataset: Dataset[Any], size: int, noise: float, seed: int, length: int) -> None:
         self.dataset, self.size, self.noise, self.seed, self.length = dataset, size, noise, seed, length
@@ -38,7 +38,7 @@ class TransformedShapes(Dataset[Sample | ShapeSpec]):
 
 
 def perturb_cameras(cameras: CameraTensors, degrees: float, seed: int, epoch: int, index: int) -> CameraTensors:
-    """Cameras turned about the object by up to so many degrees, always the same for a seed, an epoch and an index."""
+    """Cameras rotated about the object by at most so many degrees; a function of seed, epoch and index."""
     if degrees == 0:
         return cameras
     state = np.random.SeedSequence([seed, epoch, index, NOISE]).generate_state(1, np.uint64)
@@ -47,13 +47,9 @@ def perturb_cameras(cameras: CameraTensors, degrees: float, seed: int, epoch: in
 
 
 def resize_sample(sample: Sample, size: int) -> Sample:
-    """A sample with square images of another size: smaller ones hold means of areas, larger ones are interpolated.
+    """A sample with square images of ``size`` pixels: means over areas if smaller, else bilinearly interpolated.
 
-    Depth is the mean over the object's part of the area, and the object is what covers half of it or more.
-
-    Args:
-        sample: of any image size.
-        size: height and width in pixels.
+    Depth is the mean over the object's part of an area; the mask is where the object covers at least half of it.
 
     Example:
         >>> import torch
@@ -84,13 +80,7 @@ def resize_sample(sample: Sample, size: int) -> Sample:
 
 
 def resize_views(images: Tensor, cameras: CameraTensors, size: int) -> tuple[Tensor, CameraTensors]:
-    """Square images of another size, and their cameras: smaller ones hold means of areas, larger are interpolated.
-
-    Args:
-        images: (..., 3, H, W) of any size.
-        cameras: of the same leading shape.
-        size: height and width in pixels.
-    """
+    """Images (..., 3, H, W) resized to squares of ``size`` pixels, see `resize_sample`, and their cameras."""
     if tuple(images.shape[-2:]) == (size, size):
         return images, cameras
     mode = "area" if size < images.shape[-1] else "bilinear"

@@ -1,6 +1,6 @@
-"""Where the members of a shard lie, by the headers of its tar; and its sidecar, the seal by which damage is noticed.
+"""The index of a shard, from the headers of its tar; and its sidecar, the check sums by which damage is detected.
 
-Both come from outside. Nothing is believed of them that the tar's size or another part of them contradicts.
+Both files are untrusted: all their values are checked against the tar's size and against each other.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ MEMBER = re.compile(rf"({KEY.pattern})\.({SUFFIX.pattern})\0".encode())
 
 
 class Sidecar(NamedTuple):
-    """What a sidecar says of its tar: the hash of its settings, its SHA-256, the check sums of its members in order."""
+    """The content of a sidecar: the hash of the settings, the tar's SHA-256, the check sums of its members in order."""
 
     settings: str
     sha256: str
@@ -64,19 +64,16 @@ class Sidecar(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ShardIndex:
-    """What one tar holds, in arrays: a set has millions of members.
+    """The index of one tar, in arrays, since a set has millions of members.
 
     Attributes:
         path: the tar file.
-        size: its bytes.
-        keys: of its N shapes.
-        names: of its shapes.
-        categories: of its shapes.
-        splits: of its shapes.
+        size: of the tar in bytes.
+        keys, names, categories, splits: of its N shapes.
         layouts: the different lists of suffixes.
-        layout: (N,) which of them a shape has.
-        first: (N,) where a shape's members begin in the next.
-        members: (2, M) offsets and sizes of all members; (3, M) where a sidecar has their check sums too.
+        layout: (N,) the row in ``layouts`` of each shape.
+        first: (N,) the first column in ``members`` of each shape.
+        members: (2, M) offsets and sizes of all members; (3, M) with check sums if there is a sidecar.
     """
 
     path: Path
@@ -94,16 +91,12 @@ class ShardIndex:
         return len(self.keys)
 
     def view_counts(self) -> np.ndarray:
-        """(N,) how many images each shape has."""
+        """(N,) number of images of each shape."""
         counts = [sum(s.endswith(".png") and "depth" not in s for s in layout) for layout in self.layouts]
         return np.array(counts, np.int64)[self.layout]
 
     def read(self, tar: ShardFile, row: int, suffix: str) -> bytes:
-        """The content of a member of a shape, after a look at its header and its check sum.
-
-        Raises:
-            DataError: the shape has no such member, or it is damaged.
-        """
+        """The content of a member of a shape; a DataError if there is none, or its header or check sum differs."""
         name, place = f"{self.keys[row]}.{suffix}", self.layouts[self.layout[row]].get(suffix)
         if place is None:
             raise DataError(self.path, f"holds no {name}")
@@ -120,21 +113,21 @@ class ShardIndex:
 
 
 class ShardFile:
-    """A tar that is open for reading, until nobody uses it.
+    """A tar open for reading; closed when no longer referenced.
 
     Args:
         path: the tar file.
-        size: what it had when its index was read.
+        size: its size when its index was read.
 
     Raises:
-        DataError: it cannot be read, is no file, or is of another size.
+        DataError: it cannot be read, is not a file, or is of another size.
     """
 
     def __init__(self, path: Path, size: int | None = None) -> None:
         self._descriptor = -1
         self.path = path
         try:
-            # Without waiting: a pipe put in the file's place would not let go.
+            # Without waiting: a pipe in place of the file would block.
             self._descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
             status = os.fstat(self._descriptor)
         except (OSError, ValueError) as error:
@@ -158,7 +151,7 @@ class ShardFile:
 
 
 def sidecar_path(path: Path) -> Path:
-    """Where the seal of a shard lies: ``NAME-000000.json`` beside ``NAME-000000.tar``."""
+    """The sidecar of a shard: ``NAME-000000.json`` beside ``NAME-000000.tar``."""
     return path.with_suffix(".json")
 
 
@@ -168,10 +161,10 @@ def add_digest(content: bytes) -> bytes:
 
 
 def read_sidecar(tar: ShardFile) -> Sidecar:
-    """Read and check the sidecar of a shard, also one of version 1, which is an index of its members besides.
+    """Read and check the sidecar of a shard, also of version 1, which has an index of the members as well.
 
     Raises:
-        DataError: there is no sidecar, it is damaged, or it tells of another tar.
+        DataError: there is no sidecar, it is damaged, or it belongs to another tar.
     """
     sidecar = sidecar_path(tar.path)
     content = read_bytes(sidecar, MAX_SIDECAR_BYTES)
@@ -206,28 +199,27 @@ def _parse_sidecar(values: dict[str, Any], tar: ShardFile) -> Sidecar:
     parts = [values["crc32"]] if version == 2 else [entry["crc32"] for entry in values["entries"]]
     crc32 = array("q")
     for part in parts:
-        crc32.extend(array("q", part))  # refuses what is no whole number of 64 bits
+        crc32.extend(array("q", part))  # refuses all but integers of 64 bits
     return Sidecar(settings, sha256, crc32)
 
 
 def read_index(path: Path) -> ShardIndex:
-    """Read the index of a shard from the headers of its tar, and its check sums where it has a sidecar.
+    """Read the index of a shard from the headers of its tar, and the check sums of its sidecar, if it has one.
 
-    Only regular files with the names of members are taken. Extended headers are stepped over: a name that needs one
-    is no member's.
+    Only regular files with the names of members are allowed. Extended headers are skipped, as no member needs one.
 
     Raises:
-        DataError: no such tar, what is there is damaged, or it holds something else.
+        DataError: no such tar, or it is damaged, or has other content.
     """
     tar = ShardFile(path)
     crc32 = read_sidecar(tar).crc32 if os.path.lexists(sidecar_path(path)) else None
-    shapes: dict[bytes, dict[bytes, int]] = {}  # the number of each member
+    shapes: dict[bytes, dict[bytes, int]] = {}  # the number of each member in the tar
     texts: dict[bytes, dict[str, str | None]] = {}
     offsets, sizes = array("q"), array("q")
     for block, offset, size in _headers(tar):
         match = MEMBER.match(block)
         if match is None or block[345]:  # a name of two parts is a path
-            raise DataError(path, f"holds a file that is no member of a shape: {block[:80].rstrip(bytes(1))!r}")
+            raise DataError(path, f"holds a file that is not a member of a shape: {block[:80].rstrip(bytes(1))!r}")
         key, suffix = match.groups()
         members = shapes.setdefault(key, {})
         if members.setdefault(suffix, len(sizes)) != len(sizes):
@@ -241,7 +233,7 @@ def read_index(path: Path) -> ShardIndex:
     if crc32 is not None and len(crc32) != len(sizes):
         raise DataError(sidecar_path(path), f"has {len(crc32)} check sums; {path.name} holds {len(sizes)} members")
     layouts: dict[tuple[bytes, ...], int] = {}
-    layout, first, order = array("q"), array("q"), array("q")  # members of a shape need not follow each other
+    layout, first, order = array("q"), array("q"), array("q")  # members of a shape may be apart
     for key, members in shapes.items():
         if key not in texts:
             raise DataError(path, f"holds no {key.decode()}.json")
@@ -267,8 +259,8 @@ def read_index(path: Path) -> ShardIndex:
 def _headers(tar: ShardFile) -> Iterator[tuple[bytes, int, int]]:
     """(header, offset, size) of the regular files of a tar.
 
-    The standard library's reader is not used: it follows extended headers of any length, some versions never end on
-    negative sizes, and it takes five times as long.
+    The standard library's reader is not used: it follows extended headers of any length, loops on negative sizes in
+    some versions, and takes five times as long.
     """
     position = count = 0
     while (block := tar.read(position, BLOCK)) != END:
@@ -288,5 +280,5 @@ def _headers(tar: ShardFile) -> Iterator[tuple[bytes, int, int]]:
         if kind in (tarfile.REGTYPE, tarfile.AREGTYPE):
             yield block, begin, size
         elif kind not in (tarfile.XHDTYPE, tarfile.XGLTYPE) or size > MAX_EXTENSION_BYTES:
-            raise DataError(tar.path, f"holds something else than regular files at byte {position}")
+            raise DataError(tar.path, f"holds other things than regular files at byte {position}")
         position = begin + -(-size // BLOCK) * BLOCK

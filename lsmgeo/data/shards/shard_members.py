@@ -1,13 +1,13 @@
-"""What a shard holds of one shape: `encode_sample` makes the members, `decode_occupancy` reads one.
+"""The members of one shape in a shard: `encode_sample` makes them, `decode_occupancy` reads one.
 
 Members of a shape, by suffix and in this order::
 
     json             name, category, split, source, mesh, seed, views, size, depth_step, cameras, voxels
     00.png           8-bit RGBA; alpha is 255 on the object and 0 elsewhere, where the colour is 0 too
-    00.depth.png     16-bit grey, depth = value * depth_step, 0 where nothing is seen
+    00.depth.png     16-bit grey, depth = value * depth_step, 0 for background
     vox32.npy        uint8, np.packbits(occupancy, axis=-1)
 
-A key, eight digits, and a dot before the suffix give the names that WebDataset expects.
+A name is a key of eight digits, a dot and the suffix, as WebDataset expects.
 """
 
 from __future__ import annotations
@@ -32,23 +32,14 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from os import PathLike
 
-__all__ = [
-    "KEY",
-    "SUFFIX",
-    "decode_occupancy",
-    "encode_sample",
-    "format_key",
-]
+__all__ = ["KEY", "SUFFIX", "decode_occupancy", "encode_sample", "format_key"]
 
 KEY = re.compile(r"[0-9]{8}")
 SUFFIX = re.compile(r"json|[0-9]{2,3}\.png|[0-9]{2,3}\.depth\.png|vox[1-9][0-9]{0,2}\.npy")
 
 
 def format_key(key: int | str) -> str:
-    """The key of a shape as shards spell it: eight digits.
-
-    Raises:
-        OptionError: negative, more than eight digits, or something else.
+    """The key of a shape in a shard, eight digits; an OptionError for any other key.
 
     Example:
         >>> format_key(42)
@@ -73,27 +64,27 @@ def encode_sample(
 ) -> dict[str, bytes]:
     """Encode a shape as the members of a shard; equal samples give equal bytes.
 
-    Colours become ``round(255 x)``. Depth becomes a whole number of steps, so it is off by half a step at most; a
-    sample without a mask is the object where it has depth, and everywhere where it has none.
+    Colours become ``round(255 x)``. Depth is rounded to a multiple of ``depth_step``. Without a mask, the object is
+    where depth is positive; without depth too, everywhere.
 
     Args:
         sample: the shape and its views, on the CPU, V <= 1000, sides of at most 4096 pixels.
         key: its index in the set.
         depth_step: world units of one step of 16-bit depth; 65535 steps must reach the farthest pixel.
         more_occupancy: further occupancy grids, (n, n, n) bool, of other resolutions than the sample's.
-        source: where the shape comes from.
-        seed: what it was made from.
-        split: the part of the set that it belongs to, such as "train".
+        source: of the shape.
+        seed: of the set.
+        split: such as "train".
 
     Returns:
         Suffix -> content, in the order in which a shard holds them.
 
     Raises:
-        ShapeError: shapes do not belong together, a grid is no cube, or there are too many views, pixels or voxels.
+        ShapeError: shapes do not match, a grid is not a cube, or there are too many views, pixels or voxels.
         DTypeError: wrong types.
-        CameraError: a camera that is none.
-        OptionError: an option or the sample's values are out of range: colours that are not in [0, 1], depth that is
-            negative, not finite or too far for `depth_step`, two grids of one resolution.
+        CameraError: an invalid camera.
+        OptionError: an option or a value is out of range: colours not in [0, 1], depth that is negative, not finite or
+            too far for `depth_step`, two grids of one resolution.
 
     Example:
         >>> import torch
@@ -176,7 +167,7 @@ def _mask(sample: Sample) -> Tensor:
 def _quantised_images(who: str, images: Tensor, mask: Tensor) -> np.ndarray:
     """(V, H, W, 4) uint8."""
     low, high = (float(value) for value in images.aminmax())
-    # Written so that NaN fails too; rounding may leave [0, 1] by a little.
+    # Written so that NaN fails too; rounding may slightly exceed [0, 1].
     if not (low > -1e-3 and high < 1 + 1e-3):
         raise OptionError(f"{who}: images must be in [0, 1]; got [{low:.6g}, {high:.6g}]")
     result = np.zeros((len(images), *images.shape[2:], 4), np.uint8)
@@ -188,7 +179,7 @@ def _quantised_images(who: str, images: Tensor, mask: Tensor) -> np.ndarray:
 
 
 def _quantised_depth(who: str, depth: Tensor, step: float) -> np.ndarray:
-    """(V, H, W) uint16; what is seen never rounds to 0, which means that nothing is."""
+    """(V, H, W) uint16; positive depth never becomes 0, which is background."""
     low, high = (float(value) for value in depth.aminmax())
     if not (low >= 0 and high <= 65535 * step):
         raise OptionError(
@@ -206,18 +197,14 @@ def _npy(array: np.ndarray) -> bytes:
 
 
 def decode_occupancy(content: bytes, side: int, path: str | PathLike[str], member: str) -> np.ndarray:
-    """(n, n, n) bool of an occupancy member.
-
-    Raises:
-        DataError: not such an array, or damaged.
-    """
+    """(n, n, n) bool of an occupancy member; a DataError if it is another array, or damaged."""
     shape = (side, side, (side + 7) // 8)
     stream = io.BytesIO(content)
     try:
         if np.lib.format.read_magic(stream) != (1, 0):
             raise ValueError("its version is not 1.0")
         header = np.lib.format.read_array_header_1_0(stream)
-    # The header is Python source: what literal_eval raises on damaged text is no closed list.
+    # The header is a Python literal; parsing a damaged one raises many kinds of errors.
     except Exception as error:
         raise DataError(path, f"{member} is not an array file ({error})") from error
     if header != (shape, False, np.dtype(np.uint8)):

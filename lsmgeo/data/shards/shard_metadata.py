@@ -1,4 +1,4 @@
-"""The json of a shape in a shard: what it is, how its views were taken."""
+"""The json of a shape in a shard: its name, category and source, its cameras and sizes."""
 
 from __future__ import annotations
 
@@ -29,13 +29,14 @@ Checked = TypeVar("Checked")
 
 
 class Metadata(NamedTuple):
-    """What the json of a shape says, checked.
+    """The checked content of a shape's json.
 
     Attributes:
-        name, category, split, source, mesh: as in `Sample`; the set it belongs to, where it came from.
-        seed: what it was made from, or None.
+        name, category, mesh: as in `Sample`.
+        split, source: as in `encode_sample`.
+        seed: of the set, or None.
         size: (height, width) of its images.
-        depth_step: world units of one step of the depth images, or None where there are none.
+        depth_step: world units of one step of the depth images, or None if there are none.
         intrinsics: (V, 3, 3) float64.
         cam_from_world: (V, 4, 4) float64.
         voxels: the resolutions of its occupancy grids.
@@ -61,26 +62,17 @@ class Metadata(NamedTuple):
 
 
 def is_text(value: Any) -> bool:
-    """Whether a value is one line of text, neither empty nor beyond 1024 characters."""
+    """Whether a value is one line of 1 to 1024 printable characters."""
     return isinstance(value, str) and value.isprintable() and 0 < len(value) <= 1024
 
 
 def decode_metadata(content: bytes, key: str, path: Path) -> Metadata:
-    """Read and check the json of a shape.
-
-    Args:
-        content: the member's bytes, from outside.
-        key: the shape's key.
-        path: the shard, for errors.
-
-    Raises:
-        DataError: not such a json, or values that make no sense.
-    """
+    """Read and check the untrusted json of the shape of a key; a DataError of the shard's path if it is invalid."""
     return _decode(content, key, path, _metadata)
 
 
 def decode_texts(content: bytes, key: str, path: Path) -> dict[str, str | None]:
-    """Of the json of a shape name, category, split, source and mesh alone, checked; see `decode_metadata`."""
+    """Only name, category, split, source and mesh of the json of a shape, checked; see `decode_metadata`."""
     return _decode(content, key, path, _texts)
 
 
@@ -89,7 +81,7 @@ def _decode(content: bytes, key: str, path: Path, check: Callable[[dict[str, Any
     if len(content) > MAX_BYTES:
         raise DataError(path, f"{where} is larger than the limit of {MAX_BYTES} bytes")
     try:
-        # int() of a long text is refused by Python itself; deep nesting ends in a RecursionError.
+        # Python itself refuses int() of a long text; deep nesting raises a RecursionError.
         values = json.loads(content.decode("utf-8"), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
         raise DataError(path, f"{where} is not JSON ({error})") from error

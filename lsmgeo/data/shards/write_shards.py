@@ -1,8 +1,8 @@
-"""Writing shards: tar files in WebDataset naming, each with a sidecar that seals it.
+"""Writing shards: tar files in WebDataset naming, each with a sidecar of check sums.
 
-``NAME-000000.tar`` holds the members of some hundreds of shapes (see `lsmgeo.data.members`); ``NAME-000000.json``, its
-sidecar, holds the SHA-256 of the tar, the check sums of its members and the hash of the settings that it was made with.
-The tar is written first and the sidecar after it, both atomically: a tar whose sidecar fits is whole.
+``NAME-000000.tar`` has the members of some hundreds of shapes, see `shard_members`. Its sidecar ``NAME-000000.json``
+has the SHA-256 of the tar, the check sums of its members and the hash of its settings. The tar is written first, then
+the sidecar, both atomically: a tar with a matching sidecar is complete.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from lsmgeo._checks import describe
 from lsmgeo.data.atomic_files import atomic_file, write_atomic
+from lsmgeo.data.read_files import os_errors_as_data_errors
 from lsmgeo.data.shards.shard_index import (
     BLOCK,
     MAX_MEMBER_BYTES,
@@ -40,16 +41,13 @@ __all__ = ["hash_settings", "verify_shard", "write_shard"]
 
 
 def hash_settings(settings: Mapping[str, Any]) -> str:
-    """The SHA-256 of settings, by which shards made otherwise are told apart.
+    """The SHA-256 of settings, 64 hexadecimal digits, by which shards with other settings are detected.
 
     Args:
-        settings: names and values that JSON can hold; their order does not matter.
-
-    Returns:
-        64 hexadecimal digits.
+        settings: names and JSON values, in any order.
 
     Raises:
-        OptionError: a value that JSON cannot hold.
+        OptionError: a value that JSON does not support.
 
     Example:
         >>> hash_settings({"views": 20, "size": 224}) == hash_settings({"size": 224, "views": 20})
@@ -58,7 +56,7 @@ def hash_settings(settings: Mapping[str, Any]) -> str:
     try:
         text = json.dumps(settings, sort_keys=True, separators=(",", ":"), allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise OptionError(f"hash_settings: settings must be what JSON can hold ({error})") from error
+        raise OptionError(f"hash_settings: settings must be JSON values ({error})") from error
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -67,24 +65,22 @@ def write_shard(
 ) -> Path:
     """Write a shard and its sidecar; the same content gives the same bytes.
 
-    Shapes are taken one at a time and written at once, so memory does not grow with their number. Stopped at any
-    moment, even by the loss of power, it leaves either no new shard or a whole one; the sidecar comes last. Only one
-    process may write a shard at a time.
-
-    A shard holds 10,000 shapes and 1,000,000 members, each of 64 MiB, at most; what has more is cut into several.
+    Shapes are written one at a time, so memory does not grow with their number. If writing stops at any moment, even
+    by a loss of power, there is either no new shard or a complete one; the sidecar is written last. Only one process
+    may write a shard at a time.
 
     Args:
         path: the tar file to write, ``NAME-000000.tar``.
-        items: (key, members) of each shape, in order, as `lsmgeo.data.encode_sample` makes the members.
-        settings_hash: what the shard was made with, see `hash_settings`.
+        items: (key, members) of each shape, in order, with the members of `lsmgeo.data.encode_sample`: at most 10,000
+            shapes and 1,000,000 members, each of at most 64 MiB.
+        settings_hash: of the settings of the shard, see `hash_settings`.
 
     Returns:
         The path written.
 
     Raises:
         DataError: the path does not end in ``.tar``, or a file cannot be written.
-        OptionError: nothing to write, a key that is none, a key or a name that comes twice, a member that no shard
-            holds, a json that is none, or more than a shard holds.
+        OptionError: no shape, more than the limits, an invalid or repeated key, a repeated name, or an invalid member.
 
     Example:
         >>> import tempfile, torch
@@ -108,24 +104,22 @@ def write_shard(
         for key, members in items:
             tar.add(format_key(key), members)
         content = tar.finish(settings_hash)
-        # From here to the end the shard has no sidecar rather than one that tells of other content.
-        try:
+        # Until the end the shard has no sidecar, rather than that of other content.
+        with os_errors_as_data_errors(sidecar, "replaced"):
             sidecar.unlink(missing_ok=True)
-        except OSError as error:
-            raise DataError(sidecar, f"cannot be replaced ({error})") from error
     write_atomic(sidecar, content)
     return path
 
 
 def verify_shard(path: str | os.PathLike[str], settings_hash: str) -> bool:
-    """Whether a shard is whole and was made with these settings: its SHA-256 and settings are those of its sidecar.
+    """Whether a shard is complete and has these settings: its SHA-256 and settings are those of its sidecar.
 
     Args:
         path: the tar file.
         settings_hash: as given to `write_shard`.
 
     Returns:
-        False too where the shard or its sidecar is missing or damaged: make it again.
+        False also if the shard or its sidecar is missing or damaged.
     """
     path = Path(path)
     try:
@@ -134,12 +128,12 @@ def verify_shard(path: str | os.PathLike[str], settings_hash: str) -> bool:
             return False
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest() == found.sha256
-    except OSError:  # a DataError is one
+    except OSError:  # includes DataError
         return False
 
 
 class _TarWriter:
-    """A tar file whose headers hold nothing but names and sizes; refuses what a reader would refuse."""
+    """A tar file whose headers have only names and sizes; raises where a reader would."""
 
     def __init__(self, path: Path, stream: AtomicFile) -> None:
         self._path, self._stream = path, stream
@@ -188,7 +182,7 @@ class _TarWriter:
                 raise self._refusal(f"{key}.{suffix} has {len(content)} bytes, {MAX_MEMBER_BYTES} are the limit")
 
     def finish(self, settings_hash: str) -> bytes:
-        """End the tar: two empty blocks, and more up to a full record, as tar programs expect. Returns its sidecar."""
+        """End the tar with two empty blocks, filled up to a full record as tar programs expect; returns its sidecar."""
         if not self._keys:
             raise self._refusal("there is no shape to write")
         self._write(bytes(2 * BLOCK))

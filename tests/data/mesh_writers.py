@@ -1,4 +1,4 @@
-"""Mesh files written byte by byte, by code that shares nothing with the readers, and small solids."""
+"""Mesh files written byte by byte, by code that shares nothing with the readers, and small closed meshes."""
 
 from __future__ import annotations
 

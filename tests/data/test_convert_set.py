@@ -246,7 +246,7 @@ def test_r2n2_becomes_shards_of_the_unit_cube(tmp_path, apart):
     centers = torch.stack([x, y, z], -1).double() * R2N2_SCALE
     inside = torch.linalg.norm(centers - torch.from_numpy(CENTRE), dim=-1) <= RADIUS
     assert torch.equal(sample.occupancy, inside)
-    # The ball of the smaller world, seen by the cameras that moved with it, has the outlines of the files.
+    # The ball of the smaller world, seen by the cameras scaled with it, has the silhouettes of the files.
     v, u = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
     pixels = torch.stack([u, v, torch.ones_like(u)], -1).double()
     for view, mask in enumerate(sample.mask):

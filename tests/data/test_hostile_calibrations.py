@@ -91,7 +91,7 @@ def test_calibrations_are_checked(parsed, monkeypatch, index):
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_nesting_without_end_kills_the_parser_alone(tmp_path):
+def test_nesting_without_end_kills_only_the_parser(tmp_path):
     (tmp_path / "a.yml").write_text(HEAD + "camera_matrix: " + "[" * 100_000)
     with pytest.raises(DataError, match=r"crashed its parser|made its parser fail|not a file of OpenCV"):
         data.read_calibration(tmp_path / "a.yml")

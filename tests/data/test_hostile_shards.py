@@ -43,7 +43,7 @@ def index(folder):
 
 
 def to_version_1(index):
-    """The sidecar as version 1 had it: check sums by shape, and places, which nobody reads."""
+    """The sidecar as version 1 had it: check sums by shape, and positions, which are not read."""
     crc32 = index.pop("crc32")
     entries = [{"key": "00000000", "offsets": [0], "crc32": crc32[:7]}, {"crc32": crc32[7:]}]
     index.update(version=1, shapes=2, layouts=[["json"]], entries=entries)
@@ -197,13 +197,13 @@ TARS = {
     "a path from the root": (header("/00000000.json", 0) + END, "not a member of a shape"),
     "a name with a path in it": (header("00000000./../json", 0) + END, "not a member of a shape"),
     "another file": (header("readme.txt", 0) + END, "not a member of a shape"),
-    "a link": (header("00000000.json", 0, tarfile.SYMTYPE, "/etc/passwd"), "something else than regular files"),
-    "a hard link": (header("00000000.json", 0, tarfile.LNKTYPE, "00000000.00.png"), "something else"),
-    "a device": (header("00000000.json", 0, tarfile.CHRTYPE), "something else than regular files"),
-    "a folder": (header("00000000.json", 0, tarfile.DIRTYPE), "something else than regular files"),
-    "a sparse file": (header("00000000.json", 0, tarfile.GNUTYPE_SPARSE), "something else than regular files"),
-    "a long name": (header("x", 600, tarfile.GNUTYPE_LONGNAME) + block(b"y" * 600), "something else"),
-    "a long extension": (header("x", 1 << 17, tarfile.XHDTYPE) + bytes(1 << 17), "something else than regular files"),
+    "a link": (header("00000000.json", 0, tarfile.SYMTYPE, "/etc/passwd"), "something other than regular files"),
+    "a hard link": (header("00000000.json", 0, tarfile.LNKTYPE, "00000000.00.png"), "something other"),
+    "a device": (header("00000000.json", 0, tarfile.CHRTYPE), "something other than regular files"),
+    "a folder": (header("00000000.json", 0, tarfile.DIRTYPE), "something other than regular files"),
+    "a sparse file": (header("00000000.json", 0, tarfile.GNUTYPE_SPARSE), "something other than regular files"),
+    "a long name": (header("x", 600, tarfile.GNUTYPE_LONGNAME) + block(b"y" * 600), "something other"),
+    "a long extension": (header("x", 1 << 17, tarfile.XHDTYPE) + bytes(1 << 17), "something other than regular files"),
     "no json": (header("00000000.00.png", 0) + END, "holds no 00000000.json"),
     "a member twice": (2 * header("00000000.00.png", 0) + END, "holds 00000000.00.png twice"),
     "no end": (header("00000000.00.png", 2) + block(b"{}"), "damaged tar header at byte 1024"),

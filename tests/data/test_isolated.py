@@ -40,7 +40,7 @@ def test_a_parser_gets_bytes_and_arguments_and_answers_with_arrays(tmp_path):
         assert (arrays["c"].dtype, arrays["c"].tolist()) == (np.float64, [[1.5]])
 
 
-def test_a_parser_is_alone(tmp_path, monkeypatch):
+def test_a_parser_is_isolated(tmp_path, monkeypatch):
     """Neither the folder of the script nor the caller's PYTHONPATH gives it modules, and nobody lent it the library."""
     (tmp_path / "colorsys.py").write_text("raise SystemExit(3)")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))

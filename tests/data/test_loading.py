@@ -45,7 +45,7 @@ def different(ours, theirs):
 
 
 def views_of(sample, shape):
-    """Which views of a shape a sample has, told from the cameras."""
+    """Which views of a shape a sample has, inferred from the cameras."""
     matches = (sample.cameras.intrinsics.numpy()[:, None] == shape.K.astype(np.float32)).all((-2, -1))
     assert (matches.sum(1) == 1).all()
     return matches.argmax(1).tolist()
@@ -246,7 +246,7 @@ def damaged(tmp_path):
     return tmp_path
 
 
-def test_a_bad_shape_is_told(damaged):
+def test_a_bad_shape_is_reported(damaged):
     dataset = dataset_of(damaged)
     with pytest.raises(DataError, match=r"set-000001.tar: 00000005\.0\d\.png is damaged") as caught:
         dataset[0, 5]

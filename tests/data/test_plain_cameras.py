@@ -117,7 +117,7 @@ def test_strecha_files_that_make_no_sense_are_refused(scene, tmp_path, line, tex
     assert caught.value.path == tmp_path / "0001.png.camera"
 
 
-def test_strecha_folders_are_told_apart(scene, tmp_path):
+def test_strecha_folders_are_distinguished(scene, tmp_path):
     names = [f"000{view}.png" for view in range(5)]
     write_strecha(scene, tmp_path / "a", tmp_path / "a", names)
     write_strecha(scene, tmp_path / "b", tmp_path / "b", names)

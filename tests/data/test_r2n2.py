@@ -67,7 +67,7 @@ def test_voxels_are_the_ball_whatever_their_header_says(tmp_path, apart):
         assert torch.equal(voxels.occupancy, inside)
     sample = data.open(home).sample()
     assert (sample.name, sample.category) == (MODEL, "chair")
-    # The cube of voxels becomes the unit cube, and the camera comes nearer by as much or stands farther off.
+    # The cube of voxels becomes the unit cube, and the distance of the camera is scaled with it.
     np.testing.assert_allclose(float(sample.cameras.cam_from_world[0, 2, 3]), 1.75 * 0.8 / 0.9)
 
 

@@ -119,7 +119,7 @@ def test_a_point_cloud_that_makes_no_sense_is_refused(tmp_path, positions, colou
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_no_scene_is_told_by_what_is_there(scene, tmp_path):
+def test_the_reason_why_a_folder_is_not_a_scene(scene, tmp_path):
     def refused(path, match):
         with pytest.raises(DataError, match=match):
             data.open(path)

@@ -123,7 +123,7 @@ def test_whole_shards_are_kept_and_damaged_ones_made_again(alone, tmp_path):
     assert contents(tmp_path) == contents(alone)
     changed = {path.name for path in tmp_path.glob("*.tar") if path.stat().st_mtime_ns != times[path.name]}
     assert changed == {"synthetic-13-000001.tar", "synthetic-13-000002.tar"}
-    # What a killed run told of its progress is forgotten.
+    # The progress that a killed run reported is discarded.
     (tmp_path / ".progress").mkdir()
     (tmp_path / ".progress" / "synthetic-13-000000").write_bytes(bytes(1000))
     made = render_set("synthetic-13", tmp_path, RECIPE, shapes=SHAPES, per_shard=PER_SHARD, jobs=1, progress=True)
@@ -196,7 +196,7 @@ def test_a_tree_of_meshes_becomes_a_set(tree, tmp_path):
     torch.testing.assert_close(shared.read(0, occupancy=16)[:5], first[:5], rtol=0, atol=0)
     with pytest.raises(DataError, match=r"model\.obj"):
         render_set(tree, tmp_path / "raise", RECIPE, jobs=1, on_error="raise")
-    # What is there is kept, and what was left out is told again, or refused.
+    # Existing shards are kept, and shapes that were left out are reported again, or refused.
     kept = render_set(tree, tmp_path / "set", RECIPE, jobs=1)
     assert (kept.kept, [Path(path).name for path, _ in kept.skipped]) == (1, ["model.obj"])
     with pytest.raises(DataError, match=r"model\.obj"):

@@ -60,7 +60,7 @@ def test_what_a_lens_bent_is_written_straight(scene, tmp_path, form):
     check(read, source)
 
 
-def test_what_is_cut_out_and_bent_keeps_its_outline(scene, tmp_path):
+def test_cut_out_and_distorted_images_keep_their_silhouettes(scene, tmp_path):
     write_transforms(scene, tmp_path / "source", lambda values: values.update(k1=-0.2))
     pixels = np.dstack([trimmed(scene)[2], np.full(trimmed(scene)[2].shape[:2], 255, np.uint8)])
     pixels[5:20, 7:30, 3] = 0
@@ -114,7 +114,7 @@ def test_a_rotation_that_is_nearly_one_keeps_its_camera_centre(scene, tmp_path, 
     np.testing.assert_array_equal(exact.cameras.cam_from_world[:, :3, :3].numpy(), rounded.R)
 
 
-def test_cameras_alone_stand_beside_their_images(scene, tmp_path):
+def test_only_cameras_are_written_beside_their_images(scene, tmp_path):
     source = data.open(write_transforms(scene, tmp_path))
     file = data.write_cameras_json(source, tmp_path / "alone.json")
     check(data.open(file), source)

@@ -45,7 +45,7 @@ def test_errors_of_the_shapes_pass_unchanged(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_is_told(tmp_path, monkeypatch):
+def test_a_full_disk_is_reported(tmp_path, monkeypatch):
     def full(descriptor):
         raise OSError(28, "No space left on device")
 

@@ -70,7 +70,7 @@ def test_others_read_it(tmp_path):
     gc.collect()
 
 
-def test_headers_hold_names_and_sizes_alone(tmp_path):
+def test_headers_hold_only_names_and_sizes(tmp_path):
     write_set(tmp_path, shards=1)
     with tarfile.open(tmp_path / "set-000000.tar") as tar:
         for info in tar.getmembers():
@@ -102,7 +102,7 @@ def test_depth_is_off_by_half_a_step(tmp_path):
     np.testing.assert_array_equal(read.mask.numpy(), depth > 0)  # where there is depth, there is the object
 
 
-def test_a_sample_of_images_alone(tmp_path):
+def test_a_sample_of_only_images(tmp_path):
     sample = make_shape(0).sample()._replace(depth=None, mask=None, occupancy=None, mesh=None, category=None)
     members = encode_sample(sample, "00000007")
     assert list(members) == ["json", "00.png", "01.png", "02.png"]
@@ -219,7 +219,7 @@ def read_all(folder):
 
 
 @pytest.mark.parametrize("indexed", [True, False])
-def test_damage_in_a_member_is_told_or_does_not_matter(tmp_path, indexed):
+def test_damage_in_a_member_is_reported_or_does_not_matter(tmp_path, indexed):
     """Every flipped bit gives a DataError that names the tar, or (in padding and the like) what was written.
 
     Without a sidecar there are no check sums of occupancy and json: there the values may change, within their rules.

@@ -99,8 +99,9 @@ def read_lsm_object(folder: Path, resolutions: Sequence[int]) -> tuple[PosedImag
         if isinstance(found, DataError):
             raise found
         arrays.append(found)
-    solids = zip(volumes, arrays[len(views) :], strict=True)
-    grids = tuple(_occupancy(found, side, file) for (side, file), found in solids)
+    grids = tuple(
+        _occupancy(found, side, file) for (side, file), found in zip(volumes, arrays[len(views) :], strict=True)
+    )
     return _scene(folder, views, list(zip(cameras, arrays[: len(views)], strict=True))), grids
 
 

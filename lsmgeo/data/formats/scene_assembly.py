@@ -190,7 +190,7 @@ def assemble(
     Args:
         names: a different one for each image.
         paths: their files.
-        cameras: leading shape (V,), with K as each image was taken; images with a lens get K of its `Lens.pinhole`.
+        cameras: leading shape (V,), with K of the images as stored; with a lens it becomes that of `Lens.pinhole`.
         source: the name of the format.
         file: the file that states the cameras, for errors.
         lenses: one for each image, or nothing.

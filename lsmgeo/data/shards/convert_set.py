@@ -70,7 +70,7 @@ def convert_set(
         depth: whether depth is kept, if the source has it (the LSM release does).
         splits: a ``splits.json`` with the split (train, val or test) of each object; other objects are left out. By
             default the split depends on the object's name, 0.7 / 0.1 / 0.2.
-        shapes: convert only so many objects, the first ones.
+        shapes: convert only the first so many objects.
         per_shard: objects in a shard.
         jobs: worker processes; -1 for all cores, 1 for only this process.
         on_error: "skip" leaves out and reports objects that cannot be used, "raise" stops at the first.

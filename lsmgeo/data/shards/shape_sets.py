@@ -132,7 +132,7 @@ class SyntheticSet:
         return len(self.numbers)
 
     def path(self, index: int) -> Path:
-        """The set's name: there is no file."""
+        """The set's name, since there is no file."""
         return self.folder
 
     def read(

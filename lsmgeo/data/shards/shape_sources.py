@@ -128,7 +128,7 @@ class FileSource(ABC):
         return len(self.paths)
 
     def part(self, start: int, stop: int) -> Self:
-        """Only these shapes, with their numbers, so that a task does not hold the paths of all."""
+        """Only these shapes, with their numbers, so that a task need not hold the paths of all."""
         return replace(self, paths=self.paths[start - self.first : stop - self.first], first=start)
 
     def file(self, index: int) -> str:

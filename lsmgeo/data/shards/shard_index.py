@@ -280,5 +280,5 @@ def _headers(tar: ShardFile) -> Iterator[tuple[bytes, int, int]]:
         if kind in (tarfile.REGTYPE, tarfile.AREGTYPE):
             yield block, begin, size
         elif kind not in (tarfile.XHDTYPE, tarfile.XGLTYPE) or size > MAX_EXTENSION_BYTES:
-            raise DataError(tar.path, f"holds other things than regular files at byte {position}")
+            raise DataError(tar.path, f"holds something other than regular files at byte {position}")
         position = begin + -(-size // BLOCK) * BLOCK

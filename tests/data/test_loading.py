@@ -217,7 +217,7 @@ def test_shapes_are_chosen_by_category_and_split(folder):
         ({"views": VIEWS + 1}, DataError, r"set-000000.tar: shape-0 has 5 views; 6 are asked for"),
         ({"seed": -1}, OptionError, "ShapeDataset: seed must be a whole number, at least 0; got int -1"),
         ({"depth": None}, OptionError, "depth"),
-        ({"background": "nowhere"}, DataError, "no folder of backgrounds"),
+        ({"background": "nowhere"}, DataError, "not a folder of backgrounds"),
         ({"on_error": "ignore"}, OptionError, "on_error must be one of 'raise', 'skip'"),
         *(
             ({"max_bad_fraction": value}, OptionError, r"max_bad_fraction must be a share in \[0, 1\]")

@@ -264,7 +264,7 @@ def test_without_embree_numpy_takes_over(monkeypatch):
     monkeypatch.setitem(sys.modules, "embreex", None)
     box = from_trimesh(trimesh.creation.box((0.5, 0.4, 0.3)))
     assert render_mesh(box, views(1, 16), sun((0, 1, 0))).mask.any()
-    with pytest.raises(BackendError, match=r"aarch64; install lsmgeo\[data\], or take backend=\"numpy\""):
+    with pytest.raises(BackendError, match=r"aarch64; install lsmgeo\[data\], or pass backend=\"numpy\""):
         render_mesh(box, views(1, 16), sun((0, 1, 0)), backend="embree")
 
 
@@ -273,7 +273,7 @@ def test_without_scipy_normals_are_flat_or_the_extra_is_named(monkeypatch):
     for name in ("scipy", "scipy.sparse"):
         monkeypatch.setitem(sys.modules, name, None)
     assert render_mesh(box, views(1, 16), sun((0, 1, 0)), smooth=False).mask.any()
-    with pytest.raises(BackendError, match=r"smooth normals .* scipy; install lsmgeo\[data\]"):
+    with pytest.raises(BackendError, match=r"smooth normals .* SciPy; install lsmgeo\[data\]"):
         render_mesh(box, views(1, 16), sun((0, 1, 0)))
 
 

@@ -173,7 +173,7 @@ def test_what_is_no_shard(tmp_path):
     for settings in ("", 3, "x" * 200):
         with pytest.raises(OptionError, match="settings_hash must be"):
             write_shard(path, [(0, members)], settings)
-    with pytest.raises(OptionError, match="JSON can hold"):
+    with pytest.raises(OptionError, match="must be JSON values"):
         hash_settings({"views": torch.ones(1)})
     assert list(tmp_path.iterdir()) == []
 
@@ -382,7 +382,7 @@ def test_backgrounds_from_a_folder(tmp_path):
     (folder / "ramp.png").unlink()
     with pytest.raises(DataError, match="holds no PNG or JPEG"):
         read(0)
-    with pytest.raises(DataError, match="is no folder of backgrounds"):
+    with pytest.raises(DataError, match="is not a folder of backgrounds"):
         shards.read(0, background="whlte", occupancy=8)
 
 

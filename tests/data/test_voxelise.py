@@ -283,7 +283,7 @@ def test_without_scipy_the_extra_is_named(monkeypatch):
     box = from_trimesh(trimesh.creation.box((0.5, 0.4, 0.3)))
     for name in ("scipy", "scipy.sparse"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(BackendError, match=r"scipy; install lsmgeo\[data\]"):
+    with pytest.raises(BackendError, match=r"SciPy; install lsmgeo\[data\]"):
         voxelise(box, 8)
 
 

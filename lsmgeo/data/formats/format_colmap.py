@@ -15,7 +15,7 @@ import torch
 
 from lsmgeo.cameras import from_colmap
 from lsmgeo.data.formats.lenses import Lens
-from lsmgeo.data.formats.scene_assembly import assemble, camera_errors_as_data_errors
+from lsmgeo.data.formats.scene_assembly import MAX_PARAMETER, MAX_SIDE, assemble, camera_errors_as_data_errors
 from lsmgeo.data.posed_images import Observations, PosedImages, SparsePoints
 from lsmgeo.data.read_files import (
     MAX_TEXT_BYTES,
@@ -239,9 +239,9 @@ def _read_model(folder: Path, form: str) -> ColmapModel:
     for camera_id, camera in read_cameras(path):
         if camera_id in cameras:
             raise DataError(path, f"uses camera id {camera_id} twice")
-        if not (0 < camera.width <= 1 << 17 and 0 < camera.height <= 1 << 17):
+        if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE):
             raise DataError(path, f"camera {camera_id} has an invalid size {camera.width} x {camera.height}")
-        if not (np.abs(camera.parameters) < 1e7).all() or min(camera.focal_lengths) <= 0:
+        if not (np.abs(camera.parameters) < MAX_PARAMETER).all() or min(camera.focal_lengths) <= 0:
             raise DataError(path, f"camera {camera_id}: parameters must be finite and focal lengths positive")
         cameras[camera_id] = camera
     path = folder / f"images.{form}"

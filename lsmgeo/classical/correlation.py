@@ -98,13 +98,8 @@ class Correlation:
     def aggregate(self, warped: Floats, visible: Mask, best: int, min_views: int, out: Floats, seen: Mask) -> None:
         """Write the mean cost (h, w) of the best neighbours, and where enough neighbours see a site, for one plane.
 
-        Args:
-            warped: (N, h, w) of all neighbours.
-            visible: (N, h, w).
-            best: see `lsmgeo.classical.aggregate_views`.
-            min_views: see there.
-            out: (h, w), written.
-            seen: (h, w), written.
+        ``warped`` and ``visible`` are (N, h, w), of all neighbours; ``out`` and ``seen`` (h, w) are written. ``best``
+        and ``min_views``: see `lsmgeo.classical.aggregate_views`.
         """
         number = len(warped)
         buffer = self._buffer(number + 4)

@@ -17,16 +17,8 @@ __all__ = ["fitted", "gather", "resized"]
 def gather(scene: PosedImages, views: Sequence[int], size: int) -> tuple[Tensor, CameraTensors]:
     """Load images at the size of the first; cameras are resized with them, even if aspect ratios differ.
 
-    Args:
-        scene: posed images.
-        views: their indices, the reference first.
-        size: longer side of the reference in pixels; it is never enlarged.
-
-    Returns:
-        (V, 3, h, w) RGB in [0, 1], and their cameras, leading shape (V,).
-
-    Raises:
-        DataError: an image cannot be read.
+    ``size`` is the longer side of the first in pixels; it is never enlarged. Returns (V, 3, h, w) RGB in [0, 1], and
+    cameras with leading shape (V,). Raises `DataError` if an image cannot be read.
     """
     shape = fitted(scene.size(views[0]), size)
     images = torch.stack([resized(scene.load(view), shape) for view in views])

@@ -42,16 +42,9 @@ class DepthMap(NamedTuple):
 
 
 def slab_planes(neighbours: int, channels: int, size: tuple[int, int], memory: int) -> int:
-    """The number of planes of a slab within a memory bound.
+    """The number of planes of a slab within a memory bound in bytes; `OptionError` if not even one plane fits.
 
-    Args:
-        neighbours: V - 1.
-        channels: C of the warped images, in numbers of 4 bytes.
-        size: (h, w) of the maps.
-        memory: bytes that the sweep may add to the process.
-
-    Raises:
-        OptionError: not even one plane fits.
+    A neighbour has ``channels`` numbers of 4 bytes per pixel of maps of ``size`` (h, w).
     """
     image = 4 * size[0] * size[1]
     buffers = torch.get_num_threads() * (neighbours + 4)

@@ -64,13 +64,7 @@ def sweep_planes(cameras: Cameras, near: float, far: float, num: int = 300, spac
 
 
 def longest_path(cameras: Cameras, near: float, far: float) -> float:
-    """Pixels that the centre of the reference moves from near to far, in the neighbour in which it moves most.
-
-    Args:
-        cameras: leading shape (V,), the reference first.
-        near: first depth.
-        far: last depth.
-    """
+    """Pixels that the centre of the reference moves from near to far, in the neighbour in which it moves most."""
     tensors = as_tensors(cameras, "longest_path")
     if len(tensors.shape) != 1 or tensors.shape[0] < 2:
         raise ShapeError(f"longest_path: cameras must have leading shape (V,), V at least 2; got {tensors.shape}")

@@ -24,13 +24,7 @@ class SparseError:
 
 
 def sparse_error(scene: PosedImages, view: int, depth_map: DepthMap, mask: Tensor) -> SparseError | None:
-    """Median relative depth error at the sparse points that a view observes, among the pixels of a mask.
-
-    Args:
-        scene: with or without sparse points.
-        view: the view of the depth map.
-        depth_map: of any size.
-        mask: (h, w) bool, the pixels to use.
+    """Median relative depth error at the sparse points that a view observes, among the pixels of a mask (h, w).
 
     Returns:
         The median of ``|depth - true| / true``, the number of points used, and of those observed; None without points.

@@ -122,15 +122,8 @@ def _frustum_points(scene: PosedImages, view: int, near: float, far: float) -> n
 def measured_depth_range(scene: PosedImages, view: int) -> tuple[float, float] | None:
     """Nearest and farthest depth of the sparse points that a view observes, or of its measured depth map.
 
-    Args:
-        scene: posed images.
-        view: index of the view.
-
-    Returns:
-        Their 2nd and 98th percentile, widened, world units; None where there are too few.
-
-    Raises:
-        DataError: a measured depth map cannot be read.
+    It is their 2nd and 98th percentile, widened, in world units; None if there are too few. Raises `DataError` if the
+    depth map cannot be read.
     """
     check_whole("measured_depth_range", "view", view, 0, len(scene) - 1)
     depth = np.empty(0)

@@ -84,13 +84,7 @@ def _depths(methods: Sequence[Method], batch: Batch, count: int, options: Option
 
 
 def joint_cloud(depth: Tensor, images: Tensor, cameras: CameraTensors) -> tuple[np.ndarray, np.ndarray]:
-    """The points (N, 3) of all pixels with depth, and their colours (N, 3) uint8.
-
-    Args:
-        depth: (V, H, W) camera z, 0 where there is none.
-        images: at least V, (3, H, W) each.
-        cameras: at least V, of the size of the maps.
-    """
+    """The points (N, 3) of all pixels with depth (V, H, W), not 0, and their colours (N, 3) uint8."""
     has_depth = depth > 0
     points = unproject_depth(cameras.at(slice(len(depth))), depth.double()[None])[0]
     return points[has_depth].numpy(), np.stack([as_pixels(image) for image in images[: len(depth)]])[has_depth]

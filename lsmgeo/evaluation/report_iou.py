@@ -51,16 +51,7 @@ def measure_iou(
     hulls: bool,
     background: Background = "white",
 ) -> dict[str, Scores]:
-    """IoU of every shape after every view, by method.
-
-    Args:
-        methods: voxel models of one resolution.
-        shapes: the shapes to test on.
-        views: their number.
-        options: threshold, batch.
-        hulls: whether to measure visual hulls too.
-        background: the background of the objects.
-    """
+    """IoU of every shape after every view, by method and, with ``hulls``, by visual hull."""
     rules = {HULL: "mean", STRICT_HULL: "all"} if hulls else {}
     scores = {name: Scores() for name in (*(method.name for method in methods), *rules)}
     resolution = shared(methods, "resolution")
@@ -79,14 +70,7 @@ def measure_iou(
 
 
 def table_of_views(title: str, scores: Mapping[str, Scores], views: int, papers: Mapping[str, str]) -> Table:
-    """A row for every method and, below, for its numbers in the paper.
-
-    Args:
-        title: what it shows.
-        scores: of every method after 1, 2, ... views.
-        views: the number of columns.
-        papers: the names of some methods in the paper.
-    """
+    """A row for every method and, below, for its numbers in the paper; ``papers`` are the names of methods there."""
     rows = [Row(name, one.cells(100)) for name, one in scores.items()]
     rows += [paper_row(paper, IOU[paper], views) for paper in dict.fromkeys(papers.values())]
     hull = [cell.value for cell in scores[HULL].cells()] if HULL in scores else []

@@ -119,13 +119,7 @@ def silhouette_iou(depth: Tensor, mask: Tensor) -> float:
 def hull_depth(occupancy: Tensor, grid: VoxelGrid, camera: CameraTensors) -> Tensor:
     """Camera z where the rays of a camera first meet occupied voxels, to about a voxel.
 
-    Args:
-        occupancy: (D, H, W) bool.
-        grid: its grid.
-        camera: leading shape ().
-
-    Returns:
-        (h, w) float32, of the size of the camera; 0 where a ray meets none.
+    The occupancy is (D, H, W) bool; the result (h, w) float32, of the size of the camera, 0 where a ray meets none.
     """
     height, width = int(torch.as_tensor(camera.height)), int(torch.as_tensor(camera.width))
     depth = torch.zeros(height, width)
@@ -164,11 +158,7 @@ def colour_vertices(mesh: Mesh, views: Sequence[ViewResult], behind: float) -> M
     """A mesh whose vertices have the mean of their colours in the images in which they are visible.
 
     The weight of a view is the fourth power of the cosine between its ray and the normal of the surface.
-
-    Args:
-        mesh: of any size.
-        views: images, cameras and depth maps of the same surface.
-        behind: the distance behind the depth of a view up to which a vertex is visible, in world units.
+    A vertex is visible up to a distance ``behind`` the depth of the view, in world units.
     """
     import trimesh
 

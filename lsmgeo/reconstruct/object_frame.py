@@ -81,12 +81,7 @@ def estimate_object_box(scene: PosedImages, masks: Sequence[Tensor] | None, view
     the axes in training; its diagonal becomes 1. Without silhouettes, the same from the sparse points that most images
     show. Without either, the object is where the cameras look, and fills their images. If the cameras are placed about
     the box as in training, all at one distance of about 2, position and size are those that the cameras imply, which
-    are more accurate than those from silhouettes.
-
-    Args:
-        scene: posed images.
-        masks: (H, W) bool of the views, or None.
-        views: the views of the masks.
+    are more accurate than those from silhouettes. The masks are (H, W) bool, of the ``views``.
 
     Raises:
         OptionError: the cameras look at no common point.
@@ -118,12 +113,7 @@ def in_model_frame(cameras: CameraTensors, frame: ObjectFrame) -> CameraTensors:
 
     Equation: with X_scene = c + l Q^T X, X_cam = R X_scene + t becomes X_cam / l = R Q^T X + (R c + t) / l.
 
-    Args:
-        cameras: of a scene, any leading shape.
-        frame: of the object in it.
-
-    Returns:
-        Rigid cameras, float64; pixels do not change.
+    Cameras have any leading shape; the result is rigid, float64, and pixels do not change.
     """
     E = cameras.cam_from_world.double()
     rotation, center = torch.from_numpy(frame.rotation), torch.from_numpy(np.asarray(frame.center, float))
@@ -142,11 +132,7 @@ def object_distances(scene: PosedImages, frame: ObjectFrame) -> tuple[np.ndarray
 def spread_views(scene: PosedImages, frame: ObjectFrame, usable: Sequence[int], count: int) -> list[int]:
     """Views from all around: the first, and then always the one whose direction is farthest from the chosen ones.
 
-    Args:
-        scene: posed images.
-        frame: of the object.
-        usable: views to choose from; the first is always chosen.
-        count: the largest number of views.
+    At most ``count`` of the ``usable`` views are chosen.
     """
     directions = centers(scene.cameras).numpy() - frame.center
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -160,17 +146,8 @@ def spread_views(scene: PosedImages, frame: ObjectFrame, usable: Sequence[int], 
 def crop_view(scene: PosedImages, view: int, frame: ObjectFrame, size: int, mask: Tensor | None = None) -> Crop:
     """Crop an image, pad it with white and resize it to a square in which the object is as large as in training.
 
-    The window has whole pixels, and the camera is cropped and resized with it: the geometry is exact.
-
-    Args:
-        scene: posed images.
-        view: index of the image.
-        frame: of the object.
-        size: side of the square.
-        mask: (H, W) bool, the silhouette of the object; the rest becomes white.
-
-    Raises:
-        DataError: the image cannot be read.
+    The window has whole pixels, and the camera is cropped and resized with it: the geometry is exact. Off the ``mask``
+    (H, W) bool, the silhouette of the object, the image becomes white. Raises `DataError` if it cannot be read.
     """
     image = scene.load(view)
     if mask is not None and not scene.cut_out:  # a cut-out image is on white already, with soft edges

@@ -44,14 +44,7 @@ def depth_limits(depth: torch.Tensor) -> tuple[float, float]:
 
 
 def summary(one: ViewResult, points: np.ndarray, colours: np.ndarray, title: str) -> bytes:
-    """A PNG with the image of a view, its depth, its confidence, and the points from the side.
-
-    Args:
-        one: the view.
-        points: (N, 3) of the model.
-        colours: (N, 3) uint8.
-        title: the title.
-    """
+    """A PNG with the image of a view, its depth, its confidence, and the points (N, 3) of the model from the side."""
     shape = min(1.2, one.depth.shape[0] / one.depth.shape[1])
     figure = new_figure(WIDTH, WIDTH * shape + BESIDE)
     figure.suptitle(title, wrap=True)

@@ -398,3 +398,13 @@ def test_folders_are_small():
     folders = {path for path in PACKAGE.rglob("*") if path.is_dir() and path.name != "__pycache__"}
     crowded = {folder.name for folder in folders if sum(path.suffix != ".so" for path in folder.iterdir()) > 25}
     assert crowded == set()
+
+
+def test_functions_are_short():
+    long = [
+        f"{module}.{node.name}"
+        for module, path in MODULES.items()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef) and node.end_lineno - node.lineno + 1 > 90
+    ]
+    assert long == []

@@ -1,1 +1,1 @@
-"""Timings, each against a rival of the same work in the same run."""
+"""Timings of the library and of competitors that do the same work in the same run."""

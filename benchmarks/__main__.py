@@ -1,8 +1,8 @@
-"""What the pages of the documentation show: ``python -m benchmarks [NAME ...]`` measures, prints, and keeps it.
+"""Measurements for the documentation: ``python -m benchmarks [NAME ...]`` measures, prints and saves them.
 
 Results go to benchmarks/results/NAME.json. Without a name: the operators and the models on a CPU, and what importing
-costs. Sets that cannot be distributed are read from the folder that ``LSMGEO_TEST_DATA`` names; what needs them is left
-out without.
+costs. Sets that cannot be distributed are read from the folder ``LSMGEO_TEST_DATA``; without it, benchmarks that need
+them are left out.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ USUAL = ("operators_channels_last", "operators_contiguous", "footprint", "system
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser("python -m benchmarks", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(BENCHMARKS)}")
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: whether everything works, not how fast")
-    parser.add_argument("--only", default="", help="the parts whose name holds this; nothing is kept")
-    parser.add_argument("--repeats", type=int, help="rounds; by default as many as fit into the time allowed")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes: checks that everything works, not how fast")
+    parser.add_argument("--only", default="", help="only parts whose name contains this; nothing is saved")
+    parser.add_argument("--repeats", type=int, help="rounds; by default as many as fit into the time budget")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--data", type=Path, default=os.environ.get("LSMGEO_TEST_DATA"), help="folder of the sets")
     parser.add_argument("--results", type=Path, help="folder for the JSON; by default benchmarks/results")
@@ -55,13 +55,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     if unknown := set(options.names).difference(BENCHMARKS):
         parser.error(f"there is no benchmark {sorted(unknown)}")
     torch.set_num_threads(options.threads)
-    # No pool of processes beside the timings, and an empty cache: all compile times are of a first run.
+    # No process pool besides the timings, and an empty cache: all compile times are of a first run.
     os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")
     if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = cache = tempfile.mkdtemp(prefix="lsmgeo-benchmarks-")
         atexit.register(shutil.rmtree, cache, ignore_errors=True)
     repeats = 3 if options.quick and options.repeats is None else options.repeats
-    # A quick run's figures mean nothing: they are kept only where asked for.
+    # Figures of a quick run are meaningless: they are saved only on request.
     folder = options.results or (None if options.quick or options.only else RESULTS)
     for name in options.names or USUAL:
         is_gpu = torch.cuda.is_available() and "gpu" in name

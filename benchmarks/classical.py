@@ -1,9 +1,9 @@
-"""What classical reconstruction reaches on photographs whose geometry is known; all its sections are run from here.
+"""Errors of classical reconstruction on photos with known geometry; all its sections are run from here.
 
-Each figure has the one that it was to reach beside it, or the rivals', which run here too, with settings that
-`benchmarks.classical_rivals` holds. Densities are fractions of all pixels of a view, taken in the order of the method's
-own confidence; an error at a density is over those of them whose true value is known. "Bad-2" is the fraction whose
-disparity is off by more than two pixels.
+Each figure is compared with its goal, or with the figure of a competitor, which runs here too with the settings in
+`benchmarks.classical_rivals`. Densities are fractions of all pixels of a view, in the order of the method's own
+confidence; an error at a density is over those of them whose true value is known. "Bad-2" is the fraction with a
+disparity error above two pixels.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from lsmgeo.cameras import CameraTensors, project, resize, stack
 from lsmgeo.classical import Reconstruction, hull_box, reconstruct_scene, silhouettes, visual_hull
 from lsmgeo.classical.tsdf import voxel_side
 
-Section = dict[str, Any]  # rows of the table, and the numbers that curves are drawn from
+Section = dict[str, Any]  # rows of the table, and the numbers of the curves
 
 
 def found_in(one: Reconstruction) -> Found:
-    """The depths of a view, and how far they are trusted."""
+    """The depth of a view, and its confidence."""
     depth = one.depth_map.depth.double().numpy()
     return Found(np.where(depth > 0, depth, np.nan), one.depth_map.confidence.numpy())
 
 
-# The search range of all methods: whole disparities for those that take no others.
+# The search range of all methods, in whole disparities for those that require it.
 FIRST, LAST = 4, 64
 THRESHOLD = 2.0
 DENSITIES = tuple(tenth / 10 for tenth in range(1, 11))
@@ -49,7 +49,7 @@ def depth_of(disparity: Any) -> Any:
 
 
 def disparity_of(depth: np.ndarray) -> np.ndarray:
-    """NaN where there is no depth."""
+    """Disparity, NaN without depth."""
     with np.errstate(divide="ignore"):
         return np.where(depth > 0, FOCAL_LENGTH * BASELINE / depth - OFFSET, np.nan)
 
@@ -57,7 +57,7 @@ def disparity_of(depth: np.ndarray) -> np.ndarray:
 def motorcycle(root: Path, planes: int = 300, *, unfiltered: bool = True) -> tuple[dict[str, Found], np.ndarray, float]:
     """Disparities of all methods, the true ones, and the fraction of our pixels that both directions agree on.
 
-    OpenCV's matchers say only whether they trust a pixel: their curves have a single point.
+    OpenCV's matchers have no confidence, only valid pixels: their curves have a single point.
     """
     with tempfile.TemporaryDirectory() as scratch:
         scene = data.open(write_motorcycle(root, Path(scratch)))
@@ -79,7 +79,7 @@ def motorcycle(root: Path, planes: int = 300, *, unfiltered: bool = True) -> tup
 
 
 def curve(method: Found, true: np.ndarray) -> tuple[list[float], list[float]]:
-    """Densities, of all pixels, and the fraction of wrong pixels at each; one density where confidence has no order."""
+    """Densities, of all pixels, and the fraction of wrong pixels at each; one density if the confidence is binary."""
     most = float(np.isfinite(method.value).mean())
     levels = [density for density in DENSITIES if density < most] + [most]
     levels = [most] if len(np.unique(method.confidence)) <= 2 else levels
@@ -87,7 +87,7 @@ def curve(method: Found, true: np.ndarray) -> tuple[list[float], list[float]]:
 
 
 def stereo(root: Path) -> Section:
-    """Middlebury's motorcycle: our sweep of a rectified pair against OpenCV's two matchers and the plainest sweep."""
+    """Middlebury's motorcycle: our sweep of a rectified pair against OpenCV's two matchers and a plain sweep."""
     methods, true, agreed = motorcycle(root)
     curves = {name: dict(zip(("density", "bad"), curve(method, true), strict=True)) for name, method in methods.items()}
     rows = [
@@ -97,7 +97,7 @@ def stereo(root: Path) -> Section:
         if density in (0.4, 0.7, drawn["density"][-1])
     ]
     ours, plain, rival = (methods[name] for name in ("ours, filtered", "plain ZNCC", "StereoSGBM"))
-    # Our valid pixels are those on which both directions agree.
+    # Our valid pixels are those where both directions agree.
     density = min(agreed, float(np.isfinite(ours.value).mean()))
     both = winners(ours, density) & np.isfinite(rival.value) & np.isfinite(true)
     mine, theirs = (100 * float((np.abs(method.value - true)[both] > THRESHOLD).mean()) for method in (ours, rival))
@@ -129,8 +129,8 @@ def walk(root: Path, views: list[int] | None = None) -> dict[str, np.ndarray]:
         measured = depth.double().numpy()[np.ix_(y, x)]
         true = np.where(measured > 0, measured, np.nan)
         seen = (one.view, *one.neighbours)
-        pictures = (luminance(scene.load(view)) for view in seen)
-        images = [cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA) for picture in pictures]
+        loaded = (luminance(scene.load(view)) for view in seen)
+        images = [cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in loaded]
         cameras = stack([resize(scene.camera(view), height, width) for view in seen])
         plain = plain_sweep(images, cameras, one.depths.numpy())
         for name, method in (("ours", found_in(one)), ("plain ZNCC", plain)):
@@ -139,7 +139,7 @@ def walk(root: Path, views: list[int] | None = None) -> dict[str, np.ndarray]:
 
 
 def rgbd(root: Path) -> Section:
-    """Frames of a walk through a room with measured depth: our sweep against the plainest, frame by frame."""
+    """Frames of a walk through a room with measured depth: our sweep against a plain one, frame by frame."""
     found = walk(root)
     frames, (middle, middle_plain) = len(found["ours"]), (np.median(found[name], axis=0) for name in found)
     rows = []
@@ -155,20 +155,20 @@ def rgbd(root: Path) -> Section:
 
 
 POSED = {"fountain": "strecha_fountain_quarter", "temple": "middlebury_temple", "COLMAP scene": "colmap_scene"}
-# So many views next to each other are swept, and agreement is asked of these alone; features are matched among more.
+# This many neighbouring views are swept and checked for agreement; features are matched among more.
 VIEWS, VIEWS_MATCHED = 3, 8
 
 
 def triangulated_of(scene: data.PosedImages, views: list[int], among: list[int]) -> list[Depths]:
-    """The depths of views' features, in the photographs' own size, from matches among some views."""
-    pictures = (np.rint(255 * luminance(scene.load(view))).astype(np.uint8) for view in among)
-    features = [find_features(picture) for picture in pictures]
+    """The depths of views' features, in pixels of the photos, from matches among some views."""
+    loaded = (np.rint(255 * luminance(scene.load(view))).astype(np.uint8) for view in among)
+    features = [find_features(image) for image in loaded]
     K, E = (value[among].double().numpy() for value in scene.cameras[:2])
     return [triangulate(features, K, E, among.index(view)) for view in views]
 
 
 def sparse_of(scene: data.PosedImages, view: int) -> Depths:
-    """The depths of the set's own sparse points that a view observes."""
+    """The depths of the set's sparse points that a view observes."""
     assert scene.points is not None
     seen = scene.points.observations[view]
     positions = torch.from_numpy(scene.points.positions[seen.points])
@@ -176,7 +176,7 @@ def sparse_of(scene: data.PosedImages, view: int) -> Depths:
 
 
 def errors_at(one: Reconstruction, truth: Depths, full: tuple[int, int], density: float) -> np.ndarray:
-    """Relative depth errors at the places that lie among the pixels that the method trusts most."""
+    """Relative depth errors at the features that are among the pixels of highest confidence."""
     found = found_in(one)
     height, width = found.value.shape
     x, y = np.floor((truth.pixels + 0.5) * (width / full[1], height / full[0])).astype(int).T
@@ -186,7 +186,7 @@ def errors_at(one: Reconstruction, truth: Depths, full: tuple[int, int], density
 
 
 def posed(root: Path) -> Section:
-    """Photographs with known cameras and no depth, against triangulated features, and against sparse points."""
+    """Photos with known cameras and no depth, against triangulated features and sparse points."""
     rows = []
     for name, folder in POSED.items():
         scene = data.open(root / folder)
@@ -226,7 +226,7 @@ def project_back(occupancy: torch.Tensor, grid: VoxelGrid, camera: CameraTensors
 
 
 def temple(root: Path) -> Section:
-    """The hull of a temple, in a box told from its silhouettes alone: projected back over these, and its own box."""
+    """The hull of a temple, in a box inferred from its silhouettes; its projection and its box are measured."""
     scene = data.open_scene(root / "middlebury_temple")
     masks = silhouettes(scene)
     grid, views = VoxelGrid(192, *hull_box(masks, scene.cameras)), range(len(scene))
@@ -247,8 +247,8 @@ def temple(root: Path) -> Section:
     return {"rows": rows}
 
 
-# What needs the folder of sets, and what does not.
-PHOTOGRAPHS: dict[str, Callable[[Path], Section]] = {"stereo": stereo, "rgbd": rgbd, "posed": posed, "hull": temple}
+# Sections that need the folder of sets, and sections that do not.
+ON_PHOTOS: dict[str, Callable[[Path], Section]] = {"stereo": stereo, "rgbd": rgbd, "posed": posed, "hull": temple}
 EXACT = {
     "analytic": classical_exact.analytic,
     "hull": classical_exact.hull,
@@ -263,8 +263,8 @@ def measure(settings: Settings) -> list[dict[str, Any]]:
     for name in ("analytic", "stereo", "rgbd", "posed", "hull", "tsdf", "speed"):
         if settings.only in name:
             start = time.perf_counter()
-            is_here = name in PHOTOGRAPHS and settings.data is not None
-            case = {"section": name, **(PHOTOGRAPHS[name](settings.data) if is_here else {"rows": []})}
+            is_here = name in ON_PHOTOS and settings.data is not None
+            case = {"section": name, **(ON_PHOTOS[name](settings.data) if is_here else {"rows": []})}
             case["rows"] += EXACT[name]() if name in EXACT else []
             cases.append({**case, "seconds": time.perf_counter() - start})
     return cases

@@ -1,4 +1,4 @@
-"""Classical reconstruction of what is known in closed form: depth, hulls and fused surfaces."""
+"""Classical reconstruction of closed-form scenes: depth, hulls and fused surfaces."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Rows = list[dict[str, Any]]
 def analytic() -> Rows:
     """Depth of textured surfaces by plane sweep.
 
-    The pictures are traced by `tests.classical.analytic`, which shares no code with the library: 96 x 72 pixels, four
+    The images are traced by `tests.classical.analytic`, which shares no code with the library: 96 x 72 pixels, four
     views, 64 planes even in inverse depth, 5 x 5 correlation; pixels nearer than three to the surface's end are left
     out. The worse of two textures counts.
     """
@@ -34,22 +34,22 @@ def analytic() -> Rows:
     for surface in (*traced.SURFACES, "corner"):
         measured = []
         for seed in (0, 1):
-            pictures = traced.render(surface, seed=seed)
-            depths, found = swept(pictures)
-            share = 100 * within_one_plane(pictures, depths, found)
-            measured.append((share, -median_error(pictures, found.depth.numpy())))
+            rendered = traced.render(surface, seed=seed)
+            depths, found = swept(rendered)
+            share = 100 * within_one_plane(rendered, depths, found)
+            measured.append((share, -median_error(rendered, found.depth.numpy())))
         within, median = (min(values) for values in zip(*measured, strict=True))
         least = 98.0 if surface == "box" else 99.5
-        # Of a corner all faces are steep: windows that face the camera lie on none of them.
+        # All faces of a corner are steep: windows parallel to the image are on none of them.
         goals = ("", "") if surface == "corner" else (f"at least {least:g} %", "at most 1e-03")
         name = f"analytic {surface}"
         rows.append(row(name, "pixels within one of 64 planes", f"{within:.2f} %", goals[0], within >= least))
         rows.append(row(name, "median relative error, refined", f"{-median:.1e}", goals[1], -median <= 1e-3))
     for surface in ("slanted", "sphere"):
-        pictures, medians = traced.render(surface), []
+        rendered, medians = traced.render(surface), []
         for planes in (16, 32, 64):
-            depths, found = swept(pictures, planes)
-            medians.append(median_error(pictures, depths[found.planes.round().numpy().clip(0).astype(int)]))
+            depths, found = swept(rendered, planes)
+            medians.append(median_error(rendered, depths[found.planes.round().numpy().clip(0).astype(int)]))
         ratios = [first / second for first, second in pairwise(medians)]
         what, text = (
             "unrefined error of 16 over 32, 32 over 64 planes",
@@ -96,12 +96,12 @@ def hull(shapes: int = 10) -> Rows:
 VIEWS, SIZE, RESOLUTION = 20, 224, 64
 STEPS, SAMPLES = 5, 200_000  # points along the side of a triangle at which a mesh is sampled, and of the true surface
 RADII, HALF = np.array([0.42, 0.25, 0.33]), np.array([0.28, 0.2, 0.33])
-# Turned about two axes, so that no face lies along the grid.
-TURN = np.array([[0.8, -0.36, 0.48], [0.6, 0.48, -0.64], [0.0, 0.8, 0.6]])
+# Rotated about two axes, so that no face is parallel to the grid.
+R = np.array([[0.8, -0.36, 0.48], [0.6, 0.48, -0.64], [0.0, 0.8, 0.6]])
 
 
 def solids() -> list[tuple[str, scenes.Solid, Callable[[np.ndarray], np.ndarray], np.ndarray, float]]:
-    """Name, solid, the distance of points to its surface, points on it, and the share to be within half a voxel."""
+    """Name, solid, distance of points to its surface, points on it, goal for the fraction within half a voxel."""
     generator = np.random.default_rng(6)
     globe = generator.normal(size=(SAMPLES, 3))
     globe /= np.linalg.norm(globe, axis=1, keepdims=True)
@@ -110,28 +110,28 @@ def solids() -> list[tuple[str, scenes.Solid, Callable[[np.ndarray], np.ndarray]
     sides = generator.uniform(-1, 1, (SAMPLES, 3)) * HALF
     sides[rows, axis] = np.sign(sides[rows, axis]) * HALF[axis]
     ball, egg = scenes.sphere((0, 0, 0), 0.4), scenes.ellipsoid((0, 0, 0), tuple(RADII))
-    box, turn = scenes.box((0, 0, 0), tuple(2 * HALF)), np.c_[TURN, np.zeros(3)]
+    box, rotation = scenes.box((0, 0, 0), tuple(2 * HALF)), np.c_[R, np.zeros(3)]
     return [
         ("sphere", ball, lambda points: np.linalg.norm(points, axis=1) - 0.4, 0.4 * globe, 0.99),
-        ("ellipsoid", egg.transformed(turn), lambda p: to_ellipsoid(p @ TURN, RADII), (globe * RADII) @ TURN.T, 0.99),
+        ("ellipsoid", egg.transformed(rotation), lambda p: to_ellipsoid(p @ R, RADII), (globe * RADII) @ R.T, 0.99),
         ("box along the grid", box, lambda points: to_box(points, HALF), sides, 0.95),
-        ("box, turned", box.transformed(turn), lambda points: to_box(points @ TURN, HALF), sides @ TURN.T, 0.95),
+        ("box, turned", box.transformed(rotation), lambda points: to_box(points @ R, HALF), sides @ R.T, 0.95),
     ]
 
 
 def tsdf() -> Rows:
-    """How true surfaces fused from exact depth are, of cameras evenly spread over a sphere (the golden spiral)."""
-    turn = torch.arange(VIEWS, dtype=torch.float64)[None] + 0.5
-    azimuth, elevation = torch.rad2deg(np.pi * (3 - 5**0.5) * turn), torch.rad2deg(torch.asin(1 - 2 * turn / VIEWS))
+    """Errors of surfaces fused from exact depth, for cameras evenly distributed on a sphere (the golden spiral)."""
+    place = torch.arange(VIEWS, dtype=torch.float64)[None] + 0.5
+    azimuth, elevation = torch.rad2deg(np.pi * (3 - 5**0.5) * place), torch.rad2deg(torch.asin(1 - 2 * place / VIEWS))
     cameras = orbit(azimuth, elevation, 2.0, focal_length=1.875 * SIZE, height=SIZE, width=SIZE)
     lights = scenes.Lights(torch.tensor([[1.0, 0.0, 0.0]]), torch.full((1, 3), 0.8), torch.full((3,), 0.2))
     shares = np.array([(i, j, STEPS - i - j) for i in range(STEPS + 1) for j in range(STEPS + 1 - i)]) / STEPS
     rows, grid, section = [], VoxelGrid(RESOLUTION), "TSDF, exact depth"
     for name, solid, distance, surface, least in solids():
-        pictures = scenes.render([scenes.Scene([solid])], cameras, lights)
-        mesh = extract_mesh(fuse_depth(pictures.depth[0], select(cameras, 0, 0), grid), grid)
+        rendered = scenes.render([scenes.Scene([solid])], cameras, lights)
+        mesh = extract_mesh(fuse_depth(rendered.depth[0], select(cameras, 0, 0), grid), grid)
         points = np.einsum("sk,mkc->msc", shares, mesh.vertices.astype(np.float64)[mesh.faces]).reshape(-1, 3)
-        # Of points of the true surface, to the nearest of the mesh's points: a little more than to the mesh.
+        # From points of the true surface to the nearest sample of the mesh: slightly more than to the mesh.
         away = {"mesh to solid": np.abs(distance(points)), "solid to mesh": cKDTree(points).query(surface)[0]}
         for kind, lengths in away.items():
             voxels = lengths * RESOLUTION

@@ -1,4 +1,4 @@
-"""What classical reconstruction is measured against, with its settings, and how fast it is beside that.
+"""Competitors of classical reconstruction with their settings, and a comparison of their times.
 
 OpenCV's stereo, loops of OpenCV and warps of kornia, and the plainest plane sweep: none goes through the library's
 operators.
@@ -24,25 +24,25 @@ from lsmgeo.cameras import CameraTensors
 from lsmgeo.classical import aggregate_views, matching_costs, sweep, sweep_planes
 from tests.classical import analytic
 
-# A standard deviation that hardly counts; it was chosen among three for the lowest errors of the plain sweep.
+# A negligible standard deviation; of three values, the one with the lowest errors of the plain sweep.
 FAINT = 0.5 / 255
 
 
 def row(section: str, what: str, measured: str, goal: str = "", reached: Any = None) -> dict[str, Any]:
-    """A line of the table: what of, the figure with its statistic, and the goal where there is one."""
+    """A row of the table: its subject, the figure with its statistic, and the goal if there is one."""
     reached = bool(reached) if goal else None
     return {"section": section, "what": what, "measured": measured, "goal": goal, "reached": reached}
 
 
 class Found(NamedTuple):
-    """What a method says of every pixel of a view: depth or disparity, and how far it trusts it."""
+    """The result of a method at every pixel of a view: depth or disparity, and its confidence."""
 
     value: np.ndarray  # (h, w), NaN where it says nothing
     confidence: np.ndarray  # (h, w), higher is better, of any scale
 
 
 def winners(found: Found, density: float) -> np.ndarray:
-    """The pixels (h, w) bool that a method trusts most: of all pixels, so many; fewer where it says less."""
+    """The pixels (h, w) bool of highest confidence: a fraction of all pixels; fewer if fewer have a value."""
     confidence = np.where(np.isfinite(found.value), found.confidence, -np.inf).ravel()
     mask = np.zeros(confidence.size, bool)
     mask[np.argsort(-confidence, kind="stable")[: round(density * confidence.size)]] = True
@@ -50,19 +50,19 @@ def winners(found: Found, density: float) -> np.ndarray:
 
 
 def bad_at(found: Found, true: np.ndarray, density: float, threshold: float) -> float:
-    """The fraction of wrong pixels among those that a method trusts most and whose true value is known."""
+    """The fraction of wrong pixels among those of highest confidence whose true value is known."""
     use = winners(found, density) & np.isfinite(true)
     return float((np.abs(found.value - true)[use] > threshold).mean())
 
 
 def median_at(found: Found, true: np.ndarray, density: float) -> float:
-    """The median relative error among the pixels that a method trusts most and whose true value is known."""
+    """The median relative error among the pixels of highest confidence whose true value is known."""
     use = winners(found, density) & np.isfinite(true)
     return float(np.median((np.abs(found.value - true) / true)[use])) if use.any() else float("nan")
 
 
 def matchers(left: np.ndarray, right: np.ndarray) -> dict[str, Found]:
-    """Disparities of OpenCV's matchers for a rectified pair of (h, w, 3) uint8; trusted alike where they give any."""
+    """Disparities of OpenCV's matchers for a rectified pair of (h, w, 3) uint8, all of equal confidence."""
     block = cv2.StereoBM_create(numDisparities=64, blockSize=15)  # type: ignore[attr-defined]
     block.setUniquenessRatio(10)
     block.setDisp12MaxDiff(1)
@@ -94,7 +94,7 @@ def moments(image: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.n
 
 
 def plain_sweep(images: Sequence[np.ndarray], cameras: Any, depths: np.ndarray, window: int = 5) -> Found:
-    """The depth of the first view by the plainest plane sweep: mean ZNCC over the neighbours, the best plane wins.
+    """The depth of the first view by a plain plane sweep: mean ZNCC over the neighbours, winner takes all.
 
     Images are (h, w) float32 luminances in [0, 1], the reference first, cameras at their size. Depths are those of
     planes, with the correlation as confidence.
@@ -134,20 +134,20 @@ MEMORY = 1 << 29
 
 
 class Timed:
-    """The pictures, of an analytic scene, and their cameras."""
+    """The images of an analytic scene, and their cameras."""
 
     def __init__(self, size: tuple[int, int] = SIZE, planes: int = PLANES):
         scale = size[1] / analytic.SIZE[1]
-        pictures = analytic.render("sphere", size=size, focal=260.0 * scale, wavelength=0.045 / scale, views=5)
-        self.images, self.mask = torch.from_numpy(pictures.images), pictures.mask
-        self.cameras = CameraTensors(torch.from_numpy(pictures.K), torch.from_numpy(pictures.E), *size)
+        rendered = analytic.render("sphere", size=size, focal=260.0 * scale, wavelength=0.045 / scale, views=5)
+        self.images, self.mask = torch.from_numpy(rendered.images), rendered.mask
+        self.cameras = CameraTensors(torch.from_numpy(rendered.K), torch.from_numpy(rendered.E), *size)
         self.depths = sweep_planes(self.cameras, analytic.NEAR, analytic.FAR, planes)
-        self.relative = relative(pictures.K, pictures.E)
-        # The planes that kornia is timed on, evenly taken from all.
+        self.relative = relative(rendered.K, rendered.E)
+        # The planes that kornia is timed on, evenly spaced among all.
         self.some = np.linspace(0, planes - 1, KORNIA_PLANES).round().astype(int).tolist()
 
     def ours(self) -> Any:
-        """The library's sweep: tells also which neighbours see a site, refines, and gives a confidence."""
+        """The library's sweep, which also computes visibility, refines, and estimates confidence."""
         return sweep(self.images, self.cameras, self.depths, best=BEST, noise=NOISE, memory=MEMORY)
 
 
@@ -201,7 +201,7 @@ def opencv_sweep(timed: Timed) -> tuple[np.ndarray, np.ndarray]:
 
 
 def kornia_costs(timed: Timed) -> Tensor:
-    """Costs (p, h, w) of some planes, while a lowest one is kept: of each plane all neighbours are warped at once.
+    """Costs (p, h, w) of some planes with a running minimum: for each plane all neighbours are warped at once.
 
     Each plane costs the same.
     """
@@ -232,12 +232,12 @@ def kornia_costs(timed: Timed) -> Tensor:
 
 
 def agreement(timed: Timed) -> str:
-    """How far the results agree on the surface: pixels within one plane of OpenCV's, and differences of costs."""
+    """Agreement of the results on the surface: pixels within one plane of OpenCV's, and differences of costs."""
     found, (cost, plane), costs = timed.ours(), opencv_sweep(timed), kornia_costs(timed)
     near = (np.abs(found.planes.round().numpy() - plane) <= 1) & timed.mask
     at_planes = matching_costs(timed.images, timed.cameras, timed.depths[timed.some], noise=NOISE)
     aggregated, count = aggregate_views(*at_planes, best=BEST)
-    # Kornia's boxes repeat the border's pixels, and its warps know of no neighbour that does not see.
+    # Kornia's box filters repeat the border pixels, and its warps do not compute visibility.
     whole = (count == len(timed.images) - 1).numpy()
     whole[:, :WINDOW] = whole[:, -WINDOW:] = whole[:, :, :WINDOW] = whole[:, :, -WINDOW:] = False
     away = np.median(np.abs(found.cost.numpy() - cost)[near]), np.median(np.abs(aggregated - costs).numpy()[whole])
@@ -250,7 +250,7 @@ def added_memory(planes: int = 40) -> int:
 
 
 def speed() -> list[dict[str, Any]]:
-    """A plane sweep against loops of OpenCV and warps of kornia, all in turn in one process."""
+    """A plane sweep against loops of OpenCV and warps of kornia, alternately in one process."""
     cv2.setNumThreads(torch.get_num_threads())
     timed = Timed()
     runs = {"ours": timed.ours, "opencv": lambda: opencv_sweep(timed), "kornia": lambda: kornia_costs(timed)}
@@ -266,6 +266,6 @@ def speed() -> list[dict[str, Any]]:
         row(section, same, agreement(timed)),
     ]
     with suppress(LeftOut):
-        added, goal = measuring.alone(added_memory), f"at most {MEMORY >> 20} MiB"
+        added, goal = measuring.isolated(added_memory), f"at most {MEMORY >> 20} MiB"
         rows.append(row(section, "memory added to the process", f"{added / 2**20:.0f} MiB", goal, added <= MEMORY))
     return rows

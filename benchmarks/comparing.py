@@ -1,4 +1,4 @@
-"""A problem and its contenders: nothing is timed that computes something else; all take turns; peak memory of each."""
+"""A problem and its competitors: equal results are required, times are interleaved, peak memory is measured."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks import contenders as who
+from benchmarks import competitors as who
 from benchmarks import measuring
 from benchmarks.measuring import Settings
 from benchmarks.problems import TINY, LeftOut, Problem, Run, Scene
 
 KINDS = FORWARD, BOTH = ("forward", "forward+backward")
-# Relative norms of the difference. Rivals compute pixels in float32, which moves a sample by up to 1e-4 pixel or voxel;
-# one in some hundred thousand samples changes its nearest cell by that.
+# Relative norms of the difference. Competitors compute pixels in float32, which moves a sample by up to 1e-4 pixel or
+# voxel; one in some hundred thousand samples changes its nearest cell by that.
 TOLERANCES = {"float32": 3e-4, "float16": 5e-3, "bfloat16": 3e-2}
 NEAREST = 1e-2
-STATISTIC = 5e-3  # a view that sees a site at its image's very border, or does not, changes its mean
-INVISIBLE = 1e-4  # the share of samples at a border, about which two computations may differ
+STATISTIC = 5e-3  # rounding at an image's border may add a view to a mean or remove it
+INVISIBLE = 1e-4  # the fraction of samples at a border, where visibility may differ
 
 
 class Different(AssertionError):
-    """A contender that computes something else."""
+    """A competitor that computes something else."""
 
 
 def compare(what: str, value: Tensor, expected: Tensor, limit: float) -> None:
@@ -48,7 +48,7 @@ def tolerance(problem: Problem) -> float:
 
 
 def leaves(scene: Scene) -> list[Tensor]:
-    """What gradients are taken to: the source, and the weights of a linear map."""
+    """The inputs of gradients: the source, and the weights of a linear map."""
     source = scene.source.detach().requires_grad_()
     return [source, scene.weight.requires_grad_()] if scene.problem.operator == "reduce" else [source]
 
@@ -68,11 +68,11 @@ def check(scene: Scene, runs: Mapping[str, Run]) -> tuple[dict[str, Tensor], dic
     """Compare all with the reference.
 
     Returns:
-        A cotangent for each contender, in its output's own memory layout, and the seconds of its first calls: what it
-        compiles, loads or lays out once.
+        A cotangent for each competitor, in the memory layout of its output, and the seconds of its first calls:
+        compilation, loading and layout.
 
     Raises:
-        Different: one is not equal up to rounding.
+        Different: results differ by more than rounding.
     """
     limit, inputs, reference = tolerance(scene.problem), leaves(scene), who.ours(scene, "reference")
     expected, expected_visible = forward(reference, inputs)
@@ -99,10 +99,10 @@ def check(scene: Scene, runs: Mapping[str, Run]) -> tuple[dict[str, Tensor], dic
 
 
 def check_kernel(scene: Scene, kernel: Callable[[], tuple[Tensor, Tensor]], run: Run) -> None:
-    """Compare the kernel alone with a contender that `check` has passed.
+    """Compare only the kernel with a competitor that passed `check`.
 
     Raises:
-        Different: it is not equal up to rounding.
+        Different: results differ by more than rounding.
     """
     limit, inputs = tolerance(scene.problem), leaves(scene)
     shape = forward(run, inputs)[0].shape
@@ -122,12 +122,12 @@ def timings(
     budget: float = 10.0,
     fewest: int = measuring.FEWEST,
 ) -> list[dict[str, Any]]:
-    """A case for each kind: times of each contender, seconds of first calls, and who was left out and why.
+    """A case for each kind: times of each competitor, seconds of first calls, and reasons of competitors left out.
 
-    With `floors` also what writes the output alone, and the kernel alone.
+    With `floors` also the time to write the output, and that of only the kernel.
 
     Raises:
-        Different: one of them computes something else.
+        Different: results differ by more than rounding.
     """
     started, problem = time.perf_counter(), sized(problem, settings)
     scene = Scene(problem)
@@ -143,17 +143,17 @@ def timings(
             left_out[who.KERNEL] = str(reason)
     cases = []
     for kind in KINDS:
-        turns: dict[str, Callable[[], Any]] = {
+        calls: dict[str, Callable[[], Any]] = {
             name: partial(forward, run, inputs)
             if kind == FORWARD
             else partial(differentiate, run, inputs, cotangents[name])
             for name, run in runs.items()
         }
         if kernel:
-            turns[who.KERNEL] = kernel[kind]
+            calls[who.KERNEL] = kernel[kind]
         if floors and kind == FORWARD:
-            turns |= who.floors(next(iter(cotangents.values())).nbytes)
-        seconds = measuring.interleaved(turns, settings.repeats, budget=budget, fewest=fewest)
+            calls |= who.floors(next(iter(cotangents.values())).nbytes)
+        seconds = measuring.interleaved(calls, settings.repeats, budget=budget, fewest=fewest)
         cases.append(
             {
                 "case": f"{label}, {kind}",
@@ -169,19 +169,19 @@ def timings(
 
 
 def sized(problem: Problem, settings: Settings) -> Problem:
-    """The problem, or its tiny form."""
+    """The problem, or its tiny version."""
     tiny = {name: min(getattr(problem, name), most) for name, most in TINY.items()} if settings.quick else {}
     return problem.but(device=settings.device, **tiny)
 
 
 def taking_part(names: Iterable[str], settings: Settings) -> list[str]:
-    """All of them, in a quick run those that need not be compiled."""
+    """All of them, or in a quick run those without compilation."""
     slow = (who.COMPILED, who.COMPILED_ANY, who.AUTOMATIC) if settings.quick else ()
     return [name for name in names if name not in slow]
 
 
 def memory(problem: Problem, names: Iterable[str], settings: Settings, kind: str = BOTH) -> dict[str, dict[str, Any]]:
-    """Peak memory of each contender, on a CPU each in a process of its own.
+    """Peak memory of each competitor, on a CPU each in its own process.
 
     Returns:
         Bytes: "peak" above the inputs, and "above" that less output, visibility and gradients; or "left_out".
@@ -190,16 +190,16 @@ def memory(problem: Problem, names: Iterable[str], settings: Settings, kind: str
     for name in taking_part(names, settings):
         try:
             arguments = sized(problem, settings), name, kind
-            found[name] = measuring.alone(taken_by, *arguments, device=settings.device)
+            found[name] = measuring.isolated(taken_by, *arguments, device=settings.device)
         except LeftOut as reason:
             found[name] = {"left_out": str(reason)}
     return found
 
 
 def taken_by(problem: Problem, name: str, kind: str) -> dict[str, Any]:
-    """The peak of one contender, and the bytes of what it returns."""
+    """The peak of one competitor, and the bytes of what it returns."""
     scene = Scene(problem)
-    run, inputs = who.CONTENDERS[name](scene), leaves(scene)
+    run, inputs = who.COMPETITORS[name](scene), leaves(scene)
     output, visible = forward(run, inputs)
     cotangent, size = scene.cotangent(output) if kind == BOTH else output, sum(leaf.nbytes for leaf in inputs)
     kept = {"output": output.nbytes, "visible": 0 if visible is None else visible.nbytes}

@@ -1,9 +1,9 @@
-"""The gather form, compiled: index a channels-last table at the taps of each sample, add them up with their weights.
+"""The gather form, compiled: index a channels-last table at the taps of each sample, and add them with their weights.
 
-`torch.compile` gains nothing on `grid_sample`; as a gather, projection, taps and sum become one vectorised loop. The
-backward that it makes of that adds atomically on the threads of a CPU, which costs more than they win. So backward is a
-second graph, compiled for one thread there, that computes the taps again and passes once over the gradient.
-`contender(scene, automatic=True)` is the backward that `torch.compile` makes by itself.
+`torch.compile` gains nothing on `grid_sample`; as a gather, projection, taps and sum become one vectorised loop. Its
+derived backward uses atomic additions on the threads of a CPU, which cost more than the threads gain. So backward is a
+second graph, compiled for one thread, that recomputes the taps and passes once over the gradient.
+`competitor(scene, automatic=True)` uses the backward that `torch.compile` derives.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from torch import Tensor
 from benchmarks.problems import IMAGE, LeftOut, Run, Scene
 from benchmarks.rivals import NEAR, feature_intrinsics, pixel_rays
 
-MOST_VIEWS = 4  # statistics unroll the views, and each number of them is compiled anew
+MOST_VIEWS = 4  # statistics unroll the views, so each number of views is compiled separately
 
 
 def require_compiler() -> None:
-    """Raise `LeftOut` where nothing can be compiled for a CPU."""
+    """Raise `LeftOut` if nothing can be compiled for a CPU."""
     try:
         from torch._inductor.cpp_builder import get_cpp_compiler
 
         get_cpp_compiler()
-    except Exception as error:  # whatever is missing, the rival is left out
+    except Exception as error:  # for any reason, the competitor is left out
         raise LeftOut(f"no C++ compiler at run time ({type(error).__name__})") from error
 
 
@@ -37,7 +37,7 @@ class Samples(NamedTuple):
     index: list[Tensor]
     sizes: list[int]
     front: Tensor
-    first: Tensor  # of the table's rows: where the array starts
+    first: Tensor  # the first row of the array in the table
 
     def visible(self) -> Tensor:
         seen = self.front
@@ -49,7 +49,7 @@ class Samples(NamedTuple):
         return Samples([axis[:, v] for axis in self.index], self.sizes, self.front[:, v], self.first[:, v])
 
     def tap(self, mode: str, corner: int | Tensor) -> tuple[Tensor, Tensor]:
-        """A row of the table and its weight; both (..., corners) where `corner` holds several."""
+        """A row of the table and its weight; both (..., corners) for several corners."""
         index, inside, first = self.index, self.front, self.first
         if isinstance(corner, Tensor):
             index, inside, first = [axis[..., None] for axis in index], inside[..., None], first[..., None]
@@ -118,7 +118,7 @@ def share(visible: Tensor) -> Tensor:
 
 @lru_cache
 class Graphs:
-    """What is compiled for one kind of call. All take a table and the geometry of its samples."""
+    """The compiled functions for one kind of call. All take a table and the geometry of its samples."""
 
     def __init__(self, operator: str, statistic: str, mode: str, dynamic: bool, device: str) -> None:
         self.find = volume_samples if operator == "sweep" else image_samples
@@ -129,7 +129,7 @@ class Graphs:
         self.spread = torch.compile(self.spread_gradient, dynamic=dynamic)
         self.backward = torch.compile(self.make_gradient, dynamic=dynamic, options=options)
         # PyTorch itself transposes slowly.
-        self.turn = torch.compile(lambda values: values.transpose(-1, -2).contiguous(), dynamic=dynamic)
+        self.transpose = torch.compile(lambda values: values.transpose(-1, -2).contiguous(), dynamic=dynamic)
 
     def make_values(self, table: Tensor, *geometry: Any) -> tuple[Tensor, Tensor, Tensor]:
         """Values, visibility and the views' mean, which the variance's backward needs."""
@@ -147,7 +147,7 @@ class Graphs:
         return (squares * share(visible)[..., None] - mean * mean).to(table.dtype), visible, mean
 
     def spread_gradient(self, table: Tensor, gradient: Tensor, mean: Tensor, *geometry: Any) -> Tensor:
-        """The gradient of a statistic, (B, N, C), as one to the values of each view."""
+        """The gradient of each view's values from that of a statistic, (B, N, C)."""
         samples = self.find(*geometry)
         visible = samples.visible()
         scale = (share(visible)[:, None] * visible)[..., None]
@@ -156,13 +156,13 @@ class Graphs:
         return 2.0 * (blend(table, samples, self.mode) - mean[:, None]) * scale * gradient[:, None]
 
     def make_gradient(self, table: Tensor, gradient: Tensor, *geometry: Any) -> Tensor:
-        """The gradient of the views' values as one to the table."""
+        """The gradient of the table from that of the views' values."""
         zeros = torch.zeros_like(table, dtype=torch.float32)
         return scatter(zeros, gradient.float(), self.find(*geometry), self.mode).to(table.dtype)
 
 
 class Gather(torch.autograd.Function):
-    """A compiled forward with a compiled backward; values (..., N, C), or (..., C, N) where `planar`."""
+    """A compiled forward with a compiled backward; values (..., N, C), or (..., C, N) if `planar`."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, graphs: Graphs, planar: bool, *geometry: Any) -> Any:
@@ -170,19 +170,19 @@ class Gather(torch.autograd.Function):
         ctx.save_for_backward(table, mean)
         ctx.call = graphs, planar, geometry
         ctx.mark_non_differentiable(visible)
-        return graphs.turn(values) if planar else values, visible
+        return graphs.transpose(values) if planar else values, visible
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, _: Any) -> tuple[Any, ...]:
         graphs, planar, geometry = ctx.call
         table, mean = ctx.saved_tensors
-        gradient = graphs.turn(gradient) if planar else gradient
+        gradient = graphs.transpose(gradient) if planar else gradient
         if graphs.statistic:
             gradient = graphs.spread(table, gradient, mean, *geometry)
         return graphs.backward(table, gradient, *geometry), *(None,) * (2 + len(geometry))
 
 
-def contender(scene: Scene, dynamic: bool = False, automatic: bool = False) -> Run:
+def competitor(scene: Scene, dynamic: bool = False, automatic: bool = False) -> Run:
     """The compiled gather form of a problem."""
     problem = scene.problem
     if problem.operator not in ("unproject", "sweep"):

@@ -1,6 +1,6 @@
-"""What ``lsmgeo info`` measures on sets of known geometry, and what it names when mistakes are planted in them.
+"""What ``lsmgeo info`` measures on sets of known geometry, and what it reports when errors are planted in them.
 
-The figures stand beside what a set's publisher, or an independent measurement, says of it.
+The figures are compared with those of the set's publisher or of an independent measurement.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from benchmarks.mistakes import plants
 from lsmgeo import diagnosis
 from lsmgeo.data import detect
 
-# The motorcycle comes without its calibration file; these are the published numbers at the size of its images.
+# The motorcycle has no calibration file; these are the published numbers at the size of its images.
 FOCAL_LENGTH, CX, CY, OFFSET, BASELINE = 994.978, 311.193, 254.877, 31.086, 193.001
 
 
 class Figure(NamedTuple):
-    """A figure to reach: of the check so named, at most so much, or with ``at_least`` at least, in so many digits."""
+    """A goal for a check: an upper limit, or with ``at_least`` a lower one, compared with its number of digits."""
 
     check: str
     value: str
@@ -52,7 +52,7 @@ def write_motorcycle(root: Path, scratch: Path) -> Path:
 
 
 def copy_chessboards(root: Path, scratch: Path) -> Path:
-    """The chessboards with their list and the left lens; the M1 and D1 beside them are of other images."""
+    """The chessboards with their list and the left lens; the M1 and D1 in the same folder are of other images."""
     source, folder = root / "opencv_stereo", scratch / "chessboards"
     folder.mkdir(parents=True, exist_ok=True)
     for path in (source / "left_intrinsics.yml", source / "stereo_calib.xml", *source.glob("*[0-9].jpg")):
@@ -62,7 +62,7 @@ def copy_chessboards(root: Path, scratch: Path) -> Path:
 
 EPIPOLAR, SILHOUETTES = "epipolar error of matched features", "voxels inside the silhouettes"
 LSM = (Figure("depth points within a cell of the voxels", "99.9", "%", True), Figure(SILHOUETTES, "100.0", "%", True))
-# Name, where it lies below the folder of sets or what makes it from that in a scratch folder, and what is known of it.
+# Name, path in the folder of sets or a function that makes it in a scratch folder, and the known figures.
 SETS: tuple[tuple[str, str | Callable[[Path, Path], Path], tuple[Figure, ...]], ...] = (
     ("temple", "middlebury_temple", (Figure(EPIPOLAR, "0.16", "px"),)),
     ("fountain", "strecha_fountain_quarter", (Figure(EPIPOLAR, "0.09", "px"),)),
@@ -81,7 +81,7 @@ SETS: tuple[tuple[str, str | Callable[[Path, Path], Path], tuple[Figure, ...]], 
 def chosen(settings: Settings) -> Iterator[tuple[str, Path, Any, tuple[Figure, ...]]]:
     """Name, place, content and known figures of each set."""
     if settings.data is None:
-        print("no folder of sets: --data, or LSMGEO_TEST_DATA, names none")
+        print("no folder of sets: use --data or LSMGEO_TEST_DATA")
         return
     with tempfile.TemporaryDirectory() as scratch:
         for name, place, known in SETS:
@@ -92,13 +92,13 @@ def chosen(settings: Settings) -> Iterator[tuple[str, Path, Any, tuple[Figure, .
 
 
 def reached(figure: Figure, measured: float) -> bool:
-    """Whether a measurement is as good as the figure, in the digits that the figure has."""
+    """Whether a measurement is as good as the figure, rounded to the digits of the figure."""
     rounded = round(measured, len(figure.value.partition(".")[2]))
     return rounded >= float(figure.value) if figure.at_least else rounded <= float(figure.value)
 
 
 def figures(settings: Settings) -> list[dict[str, Any]]:
-    """One case a figure."""
+    """One case per figure."""
     cases = []
     for name, path, content, known in chosen(settings):
         start = time.perf_counter()
@@ -126,7 +126,7 @@ def figures(settings: Settings) -> list[dict[str, Any]]:
 
 
 def mistakes(settings: Settings) -> list[dict[str, Any]]:
-    """One case a planted mistake."""
+    """One case per planted error."""
     cases = []
     for name, path, content, _ in chosen(settings):
         for planted, plant in plants(content).items():

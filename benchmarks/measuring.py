@@ -1,4 +1,4 @@
-"""Time, peak memory, where they were measured, and the file that keeps them."""
+"""Time, peak memory, the machine, and the file of results."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ STATUS, REFERENCES = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 class Settings:
     """How to run."""
 
-    quick: bool = False  # tiny sizes, few rounds, nothing compiled: whether everything works, not how fast
-    repeats: int | None = None  # rounds; None fills the time that each benchmark allows itself
+    quick: bool = False  # tiny sizes, few rounds, no compilation: checks that everything works, not how fast
+    repeats: int | None = None  # rounds; None fills the time budget of each benchmark
     device: str = "cpu"  # or "cuda"
     data: Path | None = None  # folder of the sets that cannot be distributed; None where there is none
     only: str = ""  # of a benchmark in several parts, those whose name holds this
@@ -45,27 +45,27 @@ def interleaved(
     budget: float = 10.0,
     fewest: int = FEWEST,
 ) -> dict[str, list[float]]:
-    """Seconds of each run: one after another in turn, so that a busy moment meets all alike; the order alternates.
+    """Seconds of each run, interleaved so that other load affects all equally; the order alternates.
 
     Without `repeats` there are as many rounds as fit into `budget` seconds, between `fewest` and `MOST`. The clock
     waits for a GPU.
     """
     order, taken = list(runs), {name: list[float]() for name in runs}
 
-    def turn() -> float:
+    def round_of_all() -> float:
         order.reverse()
         for name in order:
             start = timer()
             result = runs[name]()
-            del result  # giving its memory back is part of the call
+            del result  # freeing its memory is part of the call
             taken[name].append(timer() - start)
         return sum(seconds[-1] for seconds in taken.values())
 
-    spent = [turn() for _ in range(warm_up)]
+    spent = [round_of_all() for _ in range(warm_up)]
     if repeats is None:
         repeats = min(MOST, max(fewest, int(budget / max(spent[-1], 1e-6))))
     for _ in range(repeats):
-        turn()
+        round_of_all()
     return {name: seconds[warm_up:] for name, seconds in taken.items()}
 
 
@@ -77,20 +77,20 @@ def spread(seconds: list[float]) -> dict[str, Any]:
 
 
 def rate(case: str, unit: str, rates: Iterable[float], target: float | None = None) -> dict[str, Any]:
-    """A case of something done so many times a second, in several rounds."""
+    """A case of a rate per second, measured in several rounds."""
     found = sorted(rates)
     middle = statistics.median(found)
     return {"case": case, "unit": unit, "rate": middle, "slowest": found[0], "fastest": found[-1], "target": target}
 
 
 def peak(run: Callable[[], Any], device: str = "cpu") -> int:
-    """Bytes that a call takes at its peak above those in use before it.
+    """Peak bytes of a call above those in use before it.
 
     PyTorch counts on a GPU. Linux keeps the high-water mark of a process's resident memory (VmHWM) and sets it back on
     request.
 
     Raises:
-        LeftOut: this system tells no peak.
+        LeftOut: this system does not report a peak.
     """
     run()  # pools, caches and code of the first call are not counted
     gc.collect()
@@ -102,9 +102,9 @@ def peak(run: Callable[[], Any], device: str = "cpu") -> int:
         torch.cuda.synchronize()
         return torch.cuda.max_memory_allocated() - before
     if not os.access(REFERENCES, os.W_OK):
-        raise LeftOut("this system tells no peak")
+        raise LeftOut("this system does not report a peak")
     if platform.libc_ver()[0] == "glibc":
-        ctypes.CDLL(None).malloc_trim(0)  # else freed blocks of the first call are used unseen
+        ctypes.CDLL(None).malloc_trim(0)  # freed blocks of the first call would be reused uncounted
     before = _status("VmRSS")
     REFERENCES.write_text("5", encoding="ascii")
     run()
@@ -116,16 +116,16 @@ def _status(key: str) -> int:
     return int(line.split()[1]) * 1024
 
 
-def _answer(threads: int, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+def _call(threads: int, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
     torch.set_num_threads(threads)
     return function(*arguments)
 
 
-def alone(function: Callable[..., Any], *arguments: Any, device: str = "cpu", limit: float = 300.0) -> Any:
-    """What a function of a module answers; on a CPU in a process of its own, forked from one that has imported all.
+def isolated(function: Callable[..., Any], *arguments: Any, device: str = "cpu", limit: float = 300.0) -> Any:
+    """The result of a function; on a CPU in its own process, forked from one that has imported everything.
 
     Raises:
-        LeftOut: no memory, or no answer within `limit` seconds.
+        LeftOut: out of memory, or no result within `limit` seconds.
     """
     if device == "cuda":
         return function(*arguments)
@@ -133,7 +133,7 @@ def alone(function: Callable[..., Any], *arguments: Any, device: str = "cpu", li
     context.set_forkserver_preload(["benchmarks.comparing"])
     try:
         with context.Pool(1) as pool:
-            return pool.apply_async(_answer, (torch.get_num_threads(), function, arguments)).get(limit)
+            return pool.apply_async(_call, (torch.get_num_threads(), function, arguments)).get(limit)
     except multiprocessing.TimeoutError:
         raise LeftOut("took too long, or ended early, most likely out of memory") from None
     except MemoryError:
@@ -150,7 +150,7 @@ def processor() -> str:
 
 
 def huge_pages() -> str:
-    """When the system gives huge pages: "always", "madvise", "never", or "unknown"."""
+    """When the system provides huge pages: "always", "madvise", "never", or "unknown"."""
     try:
         text = Path("/sys/kernel/mm/transparent_hugepage/enabled").read_text(encoding="ascii")
         return text.split("[")[1].split("]")[0]

@@ -1,4 +1,4 @@
-"""Mistakes that people make with cameras, planted in what was read; nothing here is shared with what finds them."""
+"""Common errors in cameras, planted in data; independent of the code that finds them."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 SHIFT = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
 
 POSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    # Camera-to-world taken for world-to-camera.
+    # Camera-to-world used as world-to-camera.
     "poses inverted": np.linalg.inv,
-    # Cameras that look along -z with y up, taken for ones that look along z with y down.
+    # Cameras that look along -z with y up, used as ones that look along z with y down.
     "OpenGL axes": lambda pose: HALF_TURN @ pose,
-    # Cameras and world of which y points the other way: a left-handed system taken for a right-handed one.
+    # Cameras and world with y in the opposite direction: a left-handed system used as a right-handed one.
     "y flipped": lambda pose: MIRROR @ pose @ MIRROR,
 }
 INTRINSICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    # Half-integer pixel centres taken for integer ones.
+    # Half-integer pixel centres used as integer ones.
     "half a pixel": lambda K: K + SHIFT,
-    # K of pictures half as large.
+    # K of images of half the size.
     "K of another resolution": lambda K: np.diag([0.5, 0.5, 1.0]) @ K,
 }
 
 
 def _another(count: int) -> np.ndarray:
-    """An order that leaves nothing in its place, where there are more than three."""
+    """A permutation without fixed points, for more than three."""
     rng = np.random.default_rng(0)
     order = np.arange(count)[::-1] if count < 4 else rng.permutation(count)
     while count >= 4 and (order == np.arange(count)).any():
@@ -43,7 +43,7 @@ def _another(count: int) -> np.ndarray:
 
 
 def plants(content: Any) -> dict[str, Callable[[], Any]]:
-    """By name of each mistake that can be made with what was read, a call that gives the content with it."""
+    """For each error that applies to the data, by name, a call that returns the data with it."""
     if isinstance(content, PosedImages):
         made: dict[str, Callable[[], Any]] = {}
         for name, change in (POSES | INTRINSICS).items():
@@ -63,7 +63,7 @@ def plants(content: Any) -> dict[str, Callable[[], Any]]:
         made = {name: lambda change=change: _with_views(content, change) for name, change in POSES.items()}
         made |= {name: lambda change=change: _with_lenses(content, change) for name, change in INTRINSICS.items()}
         return made | {"frames shuffled": lambda: _shuffled_pairs(content)}
-    raise TypeError(f"nothing is known of mistakes with {type(content)}")
+    raise TypeError(f"no errors are defined for {type(content)}")
 
 
 def _with_cameras(scene: PosedImages, field: str, change: Callable[[np.ndarray], np.ndarray]) -> PosedImages:
@@ -73,7 +73,7 @@ def _with_cameras(scene: PosedImages, field: str, change: Callable[[np.ndarray],
 
 
 def _shuffled(scene: PosedImages) -> PosedImages:
-    """Photographs, with their depth, beside cameras of others; a camera of another size would be refused at once."""
+    """Images and their depth with the cameras of other images of the same size; other sizes would raise an error."""
     sizes = [scene.size(view) for view in range(len(scene))]
     alike = np.array([view for view, size in enumerate(sizes) if size == max(sizes, key=sizes.count)])
     order = np.arange(len(scene))
@@ -102,6 +102,6 @@ def _with_views(calibration: Calibration, change: Callable[[np.ndarray], np.ndar
 
 
 def _shuffled_pairs(calibration: Calibration) -> Calibration:
-    """The second camera's pictures in another order."""
+    """The second camera's images in another order."""
     first, second = calibration.images
     return replace(calibration, images=(first, tuple(second[index] for index in _another(len(second)))))

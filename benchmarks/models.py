@@ -1,8 +1,8 @@
 """The networks against themselves on hand-written operators, and what importing the library costs.
 
-A training step and an inference step of the preset "paper"; the rival is the same model, with the same weights, whose
-unprojection or plane sweep is what `benchmarks.rivals` writes by hand on `grid_sample`, with depth and ray directions
-appended and the sweep's channels stacked for a 1x1 convolution. Outputs and gradients are compared first.
+A training step and an inference step of the preset "paper"; the competitor is the same model, with the same weights,
+whose unprojection or plane sweep is what `benchmarks.rivals` writes by hand on `grid_sample`, with depth and ray
+directions appended and the sweep's channels stacked for a 1x1 convolution. Outputs and gradients are compared first.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, conv2d, l1_loss, normalize
 
-from benchmarks import contenders as who
+from benchmarks import competitors as who
 from benchmarks import measuring, report, rivals
 from benchmarks.comparing import compare
 from benchmarks.measuring import Settings
@@ -33,7 +33,7 @@ MODELS = {"voxel-lsm": "V-LSM", "depth-lsm": "D-LSM"}
 KINDS = ("inference", "training")
 # Float32 pixels move a sample by 1e-4 pixel at most; one in some hundred thousand samples changes its nearest voxel.
 VALUES, GRADIENTS = {"voxel-lsm": 1e-3, "depth-lsm": 1e-2}, {"voxel-lsm": 1e-2, "depth-lsm": 5e-2}
-# What the GPU is to reach with V-LSM: models a second in batches of 16, and milliseconds of one.
+# The goals of V-LSM on a GPU: models per second in batches of 16, and milliseconds of one.
 BATCH, RATE, LATENCY_MS = 16, 1000.0, 8.0
 
 
@@ -43,7 +43,7 @@ def image_size(cameras: CameraTensors) -> tuple[int, int]:
 
 
 class HandUnproject(nn.Module):
-    """What V-LSM and D-LSM ask of `lsmgeo.Unproject`, written by hand."""
+    """The part of `lsmgeo.Unproject` that V-LSM and D-LSM use, written by hand."""
 
     def __init__(self, sites: Tensor) -> None:
         super().__init__()
@@ -60,7 +60,7 @@ class HandUnproject(nn.Module):
 
 
 class HandProjectReduce(nn.Module):
-    """What D-LSM asks of `lsmgeo.rays.ProjectReduce`, written by hand."""
+    """The part of `lsmgeo.rays.ProjectReduce` that D-LSM uses, written by hand."""
 
     def __init__(self, weight: nn.Parameter, depths: Tensor, mode: str) -> None:
         super().__init__()
@@ -90,7 +90,7 @@ def by_hand(model: Any) -> Any:
 
 
 class Work:
-    """A model of each contender, and what it sees: B scenes of 4 views."""
+    """A model of each competitor, and its input: B scenes of 4 views."""
 
     def __init__(self, name: str, settings: Settings, scenes: int = 1, views: int = 4) -> None:
         torch.manual_seed(0)
@@ -106,9 +106,9 @@ class Work:
             truth = 1.5 + torch.rand(scenes, 1, views, size, size)
         self.images, self.truth = images.to(settings.device), truth.to(settings.device)
 
-    def infer(self, contender: str) -> Any:
+    def infer(self, competitor: str) -> Any:
         """From images to the result."""
-        return self.models[contender].run(self.images, self.cameras, by_view=False)
+        return self.models[competitor].run(self.images, self.cameras, by_view=False)
 
     def loss(self, model: nn.Module) -> Tensor:
         """After every view, as in training."""
@@ -116,11 +116,11 @@ class Work:
         truth = self.truth.expand_as(output)
         return binary_cross_entropy_with_logits(output, truth) if self.name == "voxel-lsm" else l1_loss(output, truth)
 
-    def step(self, contender: str, kind: str) -> Callable[[], Any]:
+    def step(self, competitor: str, kind: str) -> Callable[[], Any]:
         """One inference; or forward, loss, backward and Adam."""
         if kind == "inference":
-            return partial(self.infer, contender)
-        model = self.models[contender]
+            return partial(self.infer, competitor)
+        model = self.models[competitor]
         optimiser = torch.optim.Adam(model.parameters(), 1e-6)
 
         def train() -> None:
@@ -147,34 +147,35 @@ class Work:
         compare(f"{self.name}: gradients", gradients[who.HAND], gradients[who.OURS], GRADIENTS[self.name])
 
 
-def peak(name: str, contender: str, kind: str, settings: Settings) -> int:
-    """Bytes of a step at its peak, above images, weights, and what Adam keeps."""
+def peak(name: str, competitor: str, kind: str, settings: Settings) -> int:
+    """Bytes of a step at its peak, above images, weights and the state of Adam."""
     work = Work(name, settings)
-    work.models = {contender: work.models[contender]}
-    return measuring.peak(work.step(contender, kind), settings.device)
+    work.models = {competitor: work.models[competitor]}
+    return measuring.peak(work.step(competitor, kind), settings.device)
 
 
 def steps(settings: Settings) -> list[dict[str, Any]]:
-    """Steps of both models: times in turn, and peak memory."""
+    """Steps of both models: interleaved times, and peak memory."""
     cases = []
     for name, title in MODELS.items():
         started, work = time.perf_counter(), Work(name, settings)
         work.check()
         for kind in KINDS:
-            turns = {contender: work.step(contender, kind) for contender in work.models}
-            seconds = measuring.interleaved(turns, settings.repeats, budget=60.0)
+            calls = {competitor: work.step(competitor, kind) for competitor in work.models}
+            seconds = measuring.interleaved(calls, settings.repeats, budget=60.0)
             taken: dict[str, int | None] = dict.fromkeys(work.models)
-            for contender in work.models:
+            for competitor in work.models:
+                arguments = name, competitor, kind, settings
                 with suppress(LeftOut):
-                    taken[contender] = measuring.alone(peak, name, contender, kind, settings, device=settings.device)
-            times = {contender: measuring.spread(each) for contender, each in seconds.items()}
+                    taken[competitor] = measuring.isolated(peak, *arguments, device=settings.device)
+            times = {competitor: measuring.spread(each) for competitor, each in seconds.items()}
             cases.append({"case": f"{title}, {kind}, 1 x 4 views", "times": times, "peak": taken})
         print(f"  {title}: {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)
     return cases
 
 
 def on_gpu(settings: Settings) -> list[dict[str, Any]]:
-    """Steps, and models a second in batches and alone, in bfloat16."""
+    """Steps, and models per second in batches and one by one, in bfloat16."""
     cases = steps(settings)
     for name, title in MODELS.items():
         for scenes in (BATCH, 1):
@@ -188,7 +189,7 @@ def on_gpu(settings: Settings) -> list[dict[str, Any]]:
 
 
 def imports(settings: Settings) -> list[dict[str, Any]]:
-    """The operators against torch and kornia, imported by new processes in turn, files in the cache."""
+    """The operators against torch and kornia, imported by new processes alternately, with files in the cache."""
     codes = {"lsmgeo": "from lsmgeo import Unproject, VoxelGrid", "torch, kornia": "import torch, kornia"}
     runs = {name: partial(subprocess.run, [sys.executable, "-c", code], check=True) for name, code in codes.items()}
     seconds = measuring.interleaved(runs, settings.repeats or 11)

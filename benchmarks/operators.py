@@ -1,4 +1,4 @@
-"""The operators against hand-written and compiled PyTorch, and as other systems do it: times, memory, goals."""
+"""The operators against hand-written and compiled PyTorch, and other systems: times, memory, goals."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks import contenders as who
+from benchmarks import competitors as who
 from benchmarks import measuring, report
 from benchmarks.comparing import BOTH, FORWARD, KINDS, memory, taking_part, timings
 from benchmarks.measuring import Settings
@@ -34,7 +34,7 @@ REFERENCE_TARGETS = {FORWARD: 1.25, BOTH: 1.15}
 
 
 def goals(case: dict[str, Any], targets: tuple[float, float | None, float] | None) -> list[dict[str, Any]]:
-    """What the library promises of a case."""
+    """The goals of a case."""
     hand, floor, kernel = targets or (None, None, None)
     reference = REFERENCE_TARGETS[case["kind"]] if who.REFERENCE in case["times"] else None
     promised = (
@@ -72,7 +72,7 @@ def contiguous(settings: Settings) -> list[dict[str, Any]]:
 
 
 def footprint(settings: Settings) -> list[dict[str, Any]]:
-    """Memory, and what it buys: statistics without the views' volumes, 128^3 voxels, a sweep with its 1x1 map fused."""
+    """Memory of statistics without the views' volumes, 128^3 voxels, a sweep with its 1x1 map fused."""
     cases: list[dict[str, Any]] = []
     for problem in (MEAN, VARIANCE):
         taken = memory(problem, (who.OURS, who.REFERENCE, who.HAND, who.COMPILED), settings)
@@ -140,7 +140,7 @@ GROWTH: tuple[tuple[str, Problem, dict[str, tuple[Any, ...]]], ...] = (
     ),
     ("Sweep, trilinear", SWEEP.but(B=1), {"voxels": (16, 32, 64), "V": (1, 4), "C": (8, 32), "size": (28, 56)}),
 )
-LARGEST = 600e6  # bytes of the values of all views from which only the library's fast path is timed
+LARGEST = 600e6  # bytes of all views' values from which only the library's fast path is timed
 
 
 def growth(settings: Settings) -> list[dict[str, Any]]:
@@ -175,13 +175,13 @@ def point(label: str, problem: Problem, axis: str, value: Any, settings: Setting
     for case in cases:
         case.update(operator=label, axis=axis, value=value, left_out={**case["left_out"], **left_out})
     if axis in ("voxels", "V", "C"):
-        measured = [name for name in names if name != who.COMPILED_ANY]  # each process would compile anew
+        measured = [name for name in names if name != who.COMPILED_ANY]  # each process would compile again
         cases[-1]["memory"] = memory(problem, measured, settings)
     return cases
 
 
 ONE, ONE_SWEEP = UNPROJECT.but(B=1, voxels=128), Problem("sweep", B=1, voxels=128)
-# label, problem, share of a copy's bandwidth that it is to reach
+# label, problem, goal as a fraction of a copy's bandwidth
 GPU = (
     ("Unproject, 64^3", ONE.but(voxels=64), 0.7),
     ("Unproject, 128^3", ONE, 0.7),
@@ -194,7 +194,7 @@ GPU = (
 
 
 def gpu(settings: Settings) -> list[dict[str, Any]]:
-    """The operators on a GPU, and the share of the bandwidth of a copy, counting source and output once each."""
+    """The operators on a GPU, and the fraction of a copy's bandwidth, counting source and output once each."""
     source = torch.zeros(1 << (20 if settings.quick else 28), device=settings.device)
     target = torch.empty_like(source)
     taken = measuring.interleaved({"copy": lambda: target.copy_(source)}, 21, 3)["copy"]

@@ -1,4 +1,4 @@
-"""What is timed: a problem is a handful of numbers, from which every process makes the same tensors."""
+"""Problems to time: a problem is a few numbers, from which every process makes the same tensors."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from torch import Tensor
 
 from lsmgeo import FrustumGrid, VoxelGrid, cameras, depth_planes
 
-# From a source, a leaf or not, to what is compared: an output, and who sees what or None.
+# From a source, a leaf or not, to the compared results: an output, and visibility or None.
 Run = Callable[[Tensor], tuple[Tensor, Tensor | None]]
 
-IMAGE = 224  # pixels of the photographs; feature maps and swept maps are smaller
+IMAGE = 224  # pixels of the images; feature maps and swept maps are smaller
 TINY = {"B": 2, "V": 2, "C": 8, "size": 16, "voxels": 8, "planes": 4, "outputs": 8}
 
 
 class LeftOut(Exception):
-    """A contender that does not run a problem; the text is the reason, for the table."""
+    """A competitor cannot run a problem; the text is the reason for the table."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Problem:
 
     @property
     def frustum_size(self) -> int:
-        """Side of a frustum's images: half of the features', so that other views see it whole; all of a sweep's."""
+        """Side of a frustum's images: half of the features', so that it is inside the other views; all of a sweep's."""
         return self.size // 2 if self.operator == "frustum" else self.size
 
 
@@ -115,7 +115,7 @@ class Scene:
 
     @property
     def window(self) -> slice:
-        """The rows, and columns, of the first feature map that a frustum takes."""
+        """The rows, and columns, of the first feature map that a frustum uses."""
         return slice(self.problem.size // 4, self.problem.size // 4 + self.problem.frustum_size)
 
     @cached_property
@@ -133,6 +133,6 @@ class Scene:
         return (_random((problem.outputs, inputs), 3) * inputs**-0.5).to(problem.device, problem.torch_dtype)
 
     def cotangent(self, output: Tensor) -> Tensor:
-        """One gradient for all, in the memory layout of each contender's own output."""
+        """One gradient for all, in the memory layout of each competitor's own output."""
         values = _random(tuple(output.shape), 2).to(output.dtype)
         return torch.empty_like(output).copy_(values)

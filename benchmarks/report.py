@@ -1,4 +1,4 @@
-"""Cases as tables of text, for the terminal and, from the JSON, for the documentation: each takes what it is about."""
+"""Cases as tables of text, for the terminal and, from the JSON, for the documentation; each table selects its cases."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def goal_rows(cases: Cases) -> Rows:
 
 
 def time_rows(cases: Cases) -> Rows:
-    """One row a case, one column a contender that ran in any."""
+    """One row per case, one column per competitor that ran in any."""
     cases = [case for case in cases if case.get("times") and "peak" not in case]
     names = list(dict.fromkeys(name for case in cases for name in case["times"]))
     return [["work", *names], *([case["case"], *(milliseconds(case["times"].get(n)) for n in names)] for case in cases)]
@@ -74,7 +74,7 @@ def memory_rows(cases: Cases) -> Rows:
 
 
 def left_out_rows(cases: Cases) -> Rows:
-    """Who did not take part, and why."""
+    """The competitors left out, and why."""
     rows = [["who", "work", "reason"]]
     for case in cases:
         rows += [[name, case["case"], reason] for name, reason in case.get("left_out", {}).items()]
@@ -82,7 +82,7 @@ def left_out_rows(cases: Cases) -> Rows:
 
 
 def first_call_rows(cases: Cases) -> Rows:
-    """Seconds of the first calls of what is compiled, once a process and kind of call."""
+    """Seconds of the first calls of what is compiled, once per process and kind of call."""
     found = {
         (case["case"].rsplit(", ", 1)[0], name): f"{seconds:.1f}"
         for case in reversed(cases)  # the first of a kind of call counts
@@ -94,7 +94,7 @@ def first_call_rows(cases: Cases) -> Rows:
 
 
 def rate_rows(cases: Cases) -> Rows:
-    """Work, what was reached, the goal where there is one, and whether it is met."""
+    """Work, result, the goal if there is one, and whether it is met."""
     rows = [["work", "median", "slowest to fastest", "goal", ""]]
     for case in cases:
         if "rate" in case:
@@ -107,7 +107,7 @@ def rate_rows(cases: Cases) -> Rows:
 
 
 def figure_rows(cases: Cases) -> Rows:
-    """Set, figure, what is known of it, what was measured, and the verdict."""
+    """Set, figure, known value, measured value, and the verdict."""
     rows = [["set", "measured", "known", "here", "verdict"]]
     for case in cases:
         if "figure" in case:
@@ -120,7 +120,7 @@ def figure_rows(cases: Cases) -> Rows:
 
 
 def mistake_rows(cases: Cases) -> Rows:
-    """One row a set, one column a planted mistake: whether it is named, else what is said."""
+    """One row per set, one column per planted error: whether it is named, otherwise what is reported."""
     cases = [case for case in cases if "planted" in case]
     planted = list(dict.fromkeys(case["planted"] for case in cases))
     named = {
@@ -134,7 +134,7 @@ def mistake_rows(cases: Cases) -> Rows:
 
 
 def reached_rows(cases: Cases) -> Rows:
-    """What of, the figure, what was measured, what it was to reach, and whether it does."""
+    """Subject, figure, result, goal, and whether it is met."""
     rows = [["of", "figure", "measured", "goal", ""]]
     for case in cases:
         for row in case.get("rows", []):
@@ -172,7 +172,7 @@ TABLES: dict[str, Callable[[Cases], Rows]] = {
 
 
 def machine_line(machine: Mapping[str, Any]) -> str:
-    """Where and when, in a sentence."""
+    """Machine and date in a sentence."""
     return (
         f"{machine['device']}, {machine['cores']} cores, {machine['threads']} threads, {machine['system']}, huge pages "
         f"on {machine['huge_pages']}; lsmgeo {machine['lsmgeo']}, PyTorch {machine['torch']}, kornia "
@@ -181,7 +181,7 @@ def machine_line(machine: Mapping[str, Any]) -> str:
 
 
 def show(cases: Cases) -> None:
-    """Print all tables that the cases have rows for."""
+    """Print all tables that have rows for the cases."""
     for title, table in TABLES.items():
         header, *rows = table(cases)
         if rows:

@@ -7,7 +7,7 @@ volumes alone. Geometry is float32; half precision is sampled in float32, as its
 Other systems loop over views, as their papers' formulas say: they hold one view's volume at a time and add it to
 running sums, which is how they save memory. Backward through them keeps every view's volume all the same. kornia has no
 operator for a frustum; a user stacks the planes of `DepthWarper` (a constant depth a plane) or of `homography_warp`
-(the homography that the plane induces). Of these the running mean alone tells what is visible.
+(the homography that the plane induces). Of these only the running mean computes visibility.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torch.nn.functional import grid_sample, pad
 from benchmarks.problems import IMAGE, LeftOut, Run, Scene
 
 NEAR = 1e-6
-MODES = {"smooth": "bilinear", "nearest": "nearest"}  # `grid_sample` says bilinear in three dimensions too
+MODES = {"smooth": "bilinear", "nearest": "nearest"}  # `grid_sample` uses this name in three dimensions too
 
 
 def feature_intrinsics(K: Tensor, image: tuple[int, int], size: tuple[int, int]) -> Tensor:
@@ -83,7 +83,7 @@ def plane_sweep_project(
     front = (depths > NEAR)[:, None]
     center, rays = pixel_rays(K, E, image, size)
     points = center[:, :, None, None] + depths[:, None, None] * rays[:, :, None]  # (B, V, P, h w, 3)
-    coordinates = 2.0 * points  # cell edges at -1 and 1, as grid_sample has them
+    coordinates = 2.0 * points  # cell edges at -1 and 1, as in grid_sample
     visible = front & ((coordinates >= -1.0) & (coordinates < 1.0)).all(-1)
     source = volume.float()[:, None].expand(B, V, *volume.shape[1:]).flatten(0, 1)
     values = grid_sample(source, coordinates.reshape(B * V, *sites, 3), mode=MODES[mode], align_corners=False)
@@ -103,8 +103,8 @@ def camera_centers(E: Tensor) -> Tensor:
     return -(E[..., :3, :3].transpose(-1, -2) @ E[..., :3, 3:])[..., 0]
 
 
-def contender(scene: Scene) -> Run:
-    """The hand-written form of a problem."""
+def competitor(scene: Scene) -> Run:
+    """The hand-written solution of a problem."""
     problem = scene.problem
     K, E = scene.cameras.intrinsics, scene.cameras.cam_from_world
     image, size = (IMAGE, IMAGE), (problem.size, problem.size)
@@ -123,7 +123,7 @@ def contender(scene: Scene) -> Run:
 
 
 def running_mean(scene: Scene) -> Run:
-    """Atlas (Murez et al., 2020): every voxel takes the nearest pixel, views are summed and divided by their count."""
+    """Atlas (Murez et al., 2020): every voxel takes the nearest pixel; the sum over views over their number."""
     problem = scene.problem
     if (problem.operator, problem.mode, problem.statistic) != ("unproject", "nearest", "mean"):
         raise LeftOut("means of nearest pixels only")
@@ -165,7 +165,7 @@ def frustum(scene: Scene, *statistics: str) -> tuple[Tensor, Tensor, Tensor, Ten
 
 
 def warper(scene: Scene, statistic: str) -> tuple[Callable[[Tensor, int], Tensor], Callable[[Tensor], Tensor]]:
-    """What warps one view's features to the planes (B, C, P, h, w), and what cuts the frustum from the first view's."""
+    """Functions that warp one view's features to the planes (B, C, P, h, w) and crop the frustum of the first."""
     K, E, K0, E0 = frustum(scene, statistic)
     depths, side = scene.depths, scene.problem.frustum_size
 
@@ -226,7 +226,7 @@ def stacked(scene: Scene, planes: list[Tensor]) -> tuple[Tensor, None]:
 
 
 def depth_warper(scene: Scene) -> Run:
-    """`DepthWarper` at one constant depth after another."""
+    """`DepthWarper` for one plane after another."""
     K, E, K0, E0 = (matrices.flatten(0, 1) for matrices in frustum(scene, "", "variance"))
     K, K0 = (pad(matrices, (0, 1, 0, 1)) for matrices in (K, K0))  # kornia's (N, 4, 4)
     K[:, 3, 3] = K0[:, 3, 3] = 1.0
@@ -235,7 +235,7 @@ def depth_warper(scene: Scene) -> Run:
 
     def run(features: Tensor) -> tuple[Tensor, None]:
         sizes = torch.full((len(K),), float(problem.size), device=K.device)
-        # One size serves both its pixel grid and its normalisation: the grid is cut to the window afterwards.
+        # One size sets both its pixel grid and its normalisation: the grid is cropped to the window afterwards.
         warper = DepthWarper(PinholeCamera(K, E, sizes, sizes), problem.size, problem.size)
         warper.grid = warper.grid[:, :side, :side]
         warper.compute_projection_matrix(PinholeCamera(K0, E0, sizes, sizes))

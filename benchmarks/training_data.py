@@ -1,4 +1,4 @@
-"""How fast analytic scenes are rendered, a training set is made, and a training run is fed from it."""
+"""Speed of rendering analytic scenes, of writing a training set, and of loading it for training."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from lsmgeo.scenes import Lights, Material, Scene, box, cone, cylinder, ellipsoi
 
 VIEWS, SIZE = 20, 224
 TAKEN, BATCH, WORKERS = 4, 4, 2  # views of a shape and shapes of a training step, workers of its loader
-# A second: views rendered of ten solids, views written, shapes loaded with and without depth.
+# Per second: views rendered of ten solids, views written, shapes loaded with and without depth.
 RENDERED, WRITTEN, LOADED = 50.0, 30.0, {True: 60.0, False: 120.0}
 
 
 def ten_solids() -> Scene:
-    """A chair with a few things on it: every kind of solid, textures, one cut."""
+    """A chair with a few things on it: every kind of primitive, textures, one cut."""
     wood, cloth = Material((0.5, 0.3, 0.1)), Material((0.2, 0.3, 0.8), "checker", (1.0, 1.0, 1.0), 6.0)
     back = box((-0.22, 0.25, 0), (0.05, 0.4, 0.5), cloth)
     return Scene(
@@ -42,7 +42,7 @@ def ten_solids() -> Scene:
 
 
 def scenes(settings: Settings) -> list[dict[str, Any]]:
-    """Views a second of one scene."""
+    """Views per second of one scene."""
     size, scene = 64 if settings.quick else SIZE, ten_solids()
     azimuth = torch.linspace(0, 342, VIEWS, dtype=torch.float64)[None]
     views = orbit(azimuth, 15.0, 2.0, focal_length=1.875 * size, height=size, width=size)
@@ -76,8 +76,8 @@ def render_shapes(settings: Settings) -> list[dict[str, Any]]:
 
 
 def loading(settings: Settings) -> list[dict[str, Any]]:
-    """Shapes a second that come out of a loader, in random order, some views of each; files are in the cache."""
-    # Workers take longer to start than eight shapes to draw.
+    """Shapes per second from a loader, in random order, some views of each; files are in the cache."""
+    # Starting workers takes longer than rendering eight shapes.
     shapes, views, size, jobs = (8, 4, 64, 1) if settings.quick else (208, VIEWS, SIZE, -1)
     with tempfile.TemporaryDirectory() as folder:
         render_set("synthetic-13", folder, Recipe(views=views, size=size), shapes=shapes, jobs=jobs)

@@ -1,4 +1,4 @@
-"""Depths from matched features alone: the truth where a set has none. Nothing here goes through the library."""
+"""Depths from matched features: the truth where a set has none. Independent of the library."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ MOST_EPIPOLAR, LEAST_ANGLE = 1.0, 2.0  # px, degrees
 
 
 class Features(NamedTuple):
-    """SIFT features of one picture."""
+    """SIFT features of one image."""
 
     pixels: np.ndarray  # (N, 2) x, y, integer centres
     descriptors: np.ndarray  # (N, 128)
 
 
 class Depths(NamedTuple):
-    """Points that a view sees, and how deep they lie."""
+    """Points that are visible in a view, and their depth."""
 
     pixels: np.ndarray  # (N, 2) x, y, integer centres
     depth: np.ndarray  # (N,) camera z
 
 
-def find_features(picture: np.ndarray) -> Features:
-    """The features of a (h, w) uint8 picture."""
+def find_features(image: np.ndarray) -> Features:
+    """The features of an (h, w) uint8 image."""
     # Without precise upscaling SIFT's coordinates are a quarter of a pixel off.
     finder = cv2.SIFT_create(nfeatures=8000, contrastThreshold=0.02, enable_precise_upscale=True)  # type: ignore[attr-defined]
-    points, descriptors = finder.detectAndCompute(picture, None)
+    points, descriptors = finder.detectAndCompute(image, None)
     return Features(np.array([point.pt for point in points]).reshape(-1, 2), descriptors)
 
 
@@ -70,7 +70,7 @@ def triangulate(features: list[Features], K: np.ndarray, E: np.ndarray, referenc
 
 
 def _matches(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Pairs (M, 2) of each other's nearest descriptors, the next being clearly farther."""
+    """Pairs (M, 2) of mutually nearest descriptors that pass the ratio test."""
     pairs = cv2.BFMatcher().knnMatch(first, second, k=2)
     forward = [(m.queryIdx, m.trainIdx) for m, n in pairs if m.distance < RATIO * n.distance]
     back = {(m.trainIdx, m.queryIdx) for m in cv2.BFMatcher().match(second, first)}
@@ -78,7 +78,7 @@ def _matches(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _epipolar_error(a: np.ndarray, b: np.ndarray, K: Any, E: Any, first: int, second: int) -> float:
-    """The larger distance in pixels of two places from each other's epipolar line."""
+    """The larger distance in pixels of two points from each other's epipolar line."""
     relative = E[second] @ np.linalg.inv(E[first])
     cross = np.cross(np.eye(3), relative[:3, 3]).T  # cross @ v is t x v
     F = np.linalg.inv(K[second]).T @ cross @ relative[:3, :3] @ np.linalg.inv(K[first])

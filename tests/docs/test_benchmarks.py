@@ -1,4 +1,4 @@
-"""The benchmarks: contenders agree, one that differs stops them, each command prints its table.
+"""The benchmarks: competitors agree, one that differs stops them, each command prints its table.
 
 No time is asserted. What is compiled runs here as it stands, uncompiled.
 """
@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from benchmarks import __main__ as command
-from benchmarks import comparing, compiled, contenders, measuring, models, report
+from benchmarks import comparing, competitors, compiled, measuring, models, report
 from benchmarks.measuring import Settings
 from benchmarks.problems import TINY, Problem, Scene
 
@@ -44,12 +44,12 @@ def test_contenders_compute_the_same_and_each_takes_part_somewhere():
     taking = set()
     for problem in PROBLEMS.values():
         scene = Scene(problem)
-        runs, left_out = contenders.gather(scene, contenders.CONTENDERS)
+        runs, left_out = competitors.gather(scene, competitors.COMPETITORS)
         comparing.check(scene, runs)
-        assert set(runs) | set(left_out) == set(contenders.CONTENDERS)
+        assert set(runs) | set(left_out) == set(competitors.COMPETITORS)
         assert len(runs) >= 3
         taking |= set(runs)
-    assert taking == set(contenders.CONTENDERS)
+    assert taking == set(competitors.COMPETITORS)
 
 
 @pytest.mark.parametrize(
@@ -63,15 +63,15 @@ def test_contenders_compute_the_same_and_each_takes_part_somewhere():
     ],
 )
 def test_a_contender_that_differs_is_not_timed(fault, what, monkeypatch):
-    honest = contenders.CONTENDERS[contenders.HAND]
-    monkeypatch.setitem(contenders.CONTENDERS, "faulty", lambda scene: lambda source: fault(*honest(scene)(source)))
+    honest = competitors.COMPETITORS[competitors.HAND]
+    monkeypatch.setitem(competitors.COMPETITORS, "faulty", lambda scene: lambda source: fault(*honest(scene)(source)))
     with pytest.raises(comparing.Different, match=what):
         comparing.timings("work", PROBLEMS["unproject"], ["faulty"], Settings(repeats=1))
 
 
 def test_a_kernel_that_differs_is_not_timed():
     scene = Scene(PROBLEMS["sweep"])
-    run = contenders.ours(scene)
+    run = competitors.ours(scene)
     output, _ = comparing.forward(run, comparing.leaves(scene))
     with pytest.raises(comparing.Different, match="kernel: values differ"):
         comparing.check_kernel(scene, lambda: (1.001 * output, scene.source), run)
@@ -81,7 +81,7 @@ def test_a_kernel_that_differs_is_not_timed():
 def test_a_model_that_differs_on_hand_written_operators_is_not_timed(name):
     work = models.Work(name, Settings(quick=True), scenes=2, views=2)
     work.check()
-    work.models[contenders.HAND].unproject.sites += 0.02
+    work.models[competitors.HAND].unproject.sites += 0.02
     with pytest.raises(comparing.Different):
         work.check()
 

@@ -1,4 +1,4 @@
-"""Who competes, by the name that the tables print; the library's own calls."""
+"""All competitors by the names in the tables, and the library's own calls."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ KERNEL = "kernel, warm memory"
 
 
 def ours(scene: Scene, backend: str = "auto", fused: bool = True) -> Run:
-    """The public call. What is not fused is a sweep, and a convolution over all its channels."""
+    """The public call; without `fused`, a sweep and a convolution over all its channels."""
     problem, size = scene.problem, (scene.problem.size,) * 2
     if not fused and problem.operator != "reduce":
         raise LeftOut("there is nothing to fuse")
@@ -46,7 +46,7 @@ def ours(scene: Scene, backend: str = "auto", fused: bool = True) -> Run:
         return functional.unproject(features, scene.cameras, scene.grid, reduce=reduce, **options)
 
     def products(features: Tensor) -> Any:
-        # At the frustum's own pixels nothing is to be interpolated.
+        # At the frustum's own pixels no interpolation is needed.
         first = features[:, :1, :, None, scene.window, scene.window]
         others = scene.cameras.at((slice(None), slice(1, None)))
         volume, _ = functional.unproject(features[:, 1:], others, scene.grid, **options)
@@ -76,7 +76,7 @@ def mode_of(scene: Scene) -> str:
 
 
 def kernel(scene: Scene) -> dict[str, Callable[[], Any]]:
-    """The CPU kernel alone, forward, and with backward to the source: sites made beforehand, memory that is in use."""
+    """Only the CPU kernel, forward, and with backward to the source: sites are precomputed, memory is reused."""
     problem, source = scene.problem, scene.source
     if problem.device != "cpu" or problem.operator == "reduce" or problem.statistic == "dot":
         raise LeftOut("not one call of a kernel")
@@ -98,31 +98,30 @@ def kernel(scene: Scene) -> dict[str, Callable[[], Any]]:
 
     def both() -> tuple[Tensor, Tensor]:
         forward(source, sites, options, out=out)
-        into.zero_()  # it adds to what is there
+        into.zero_()  # the kernel accumulates
         return out, backward(gradient, source, sites, options, (True, False, False, False), into=into)[0]
 
     return {"forward": lambda: forward(source, sites, options, out=out)[0], "forward+backward": both}
 
 
 def floors(count: int) -> dict[str, Callable[[], Any]]:
-    """Writing so many bytes: into fresh memory, by the library's page policy, and again and again into the same.
+    """Writing this many bytes: into fresh memory, with the library's page policy, and repeatedly into the same memory.
 
-    A large block goes back to the system when it is freed, so that whoever makes a fresh output pays for its page
-    faults.
+    A freed large block returns to the system, so every fresh output has page faults.
     """
     shape = (count // 4,)
     buffer = library.empty(shape, torch.float32)
     return {COLD: lambda: library.empty(shape, torch.float32).fill_(1.0), WARM: lambda: buffer.fill_(1.0)}
 
 
-CONTENDERS: Mapping[str, Callable[[Scene], Run]] = {
+COMPETITORS: Mapping[str, Callable[[Scene], Run]] = {
     OURS: ours,
     REFERENCE: partial(ours, backend="reference"),
     UNFUSED: partial(ours, fused=False),
-    HAND: rivals.contender,
-    COMPILED: compiled.contender,
-    COMPILED_ANY: partial(compiled.contender, dynamic=True),
-    AUTOMATIC: partial(compiled.contender, automatic=True),
+    HAND: rivals.competitor,
+    COMPILED: compiled.competitor,
+    COMPILED_ANY: partial(compiled.competitor, dynamic=True),
+    AUTOMATIC: partial(compiled.competitor, automatic=True),
     WARPER: rivals.depth_warper,
     HOMOGRAPHY: rivals.homographies,
     ATLAS: rivals.running_mean,
@@ -132,11 +131,11 @@ CONTENDERS: Mapping[str, Callable[[Scene], Run]] = {
 
 
 def gather(scene: Scene, names: Iterable[str]) -> tuple[dict[str, Run], dict[str, str]]:
-    """The runs of those that take part, and the reasons of those that do not."""
+    """The runs of those that can run, and the reasons of those that cannot."""
     runs, left_out = {}, {}
     for name in names:
         try:
-            runs[name] = CONTENDERS[name](scene)
+            runs[name] = COMPETITORS[name](scene)
         except LeftOut as reason:
             left_out[name] = str(reason)
     return runs, left_out

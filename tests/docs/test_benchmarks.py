@@ -40,7 +40,7 @@ def _uncompiled(monkeypatch):
     compiled.Graphs.cache_clear()
 
 
-def test_contenders_compute_the_same_and_each_takes_part_somewhere():
+def test_competitors_compute_the_same_and_each_takes_part_somewhere():
     taking = set()
     for problem in PROBLEMS.values():
         scene = Scene(problem)
@@ -62,7 +62,7 @@ def test_contenders_compute_the_same_and_each_takes_part_somewhere():
         (lambda output, visible: (output * torch.nan, visible), "values differ"),
     ],
 )
-def test_a_contender_that_differs_is_not_timed(fault, what, monkeypatch):
+def test_a_competitor_that_differs_is_not_timed(fault, what, monkeypatch):
     honest = competitors.COMPETITORS[competitors.HAND]
     monkeypatch.setitem(competitors.COMPETITORS, "faulty", lambda scene: lambda source: fault(*honest(scene)(source)))
     with pytest.raises(comparing.Different, match=what):
@@ -105,7 +105,7 @@ def test_a_model_that_differs_on_hand_written_operators_is_not_timed(name):
 )
 def test_each_command_prints_its_table_and_keeps_what_docs_read(name, printed, tmp_path, monkeypatch, capsys):
     # No process of its own is forked off: that takes seconds each.
-    monkeypatch.setattr(measuring, "alone", lambda function, *arguments, **_: function(*arguments))
+    monkeypatch.setattr(measuring, "isolated", lambda function, *arguments, **_: function(*arguments))
     monkeypatch.setattr(torch, "set_num_threads", lambda number: None)
     monkeypatch.delenv("LSMGEO_TEST_DATA", raising=False)
     command.main([name, "--quick", "--repeats", "1", "--results", str(tmp_path)])

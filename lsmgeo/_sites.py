@@ -1,6 +1,6 @@
-"""From cameras and grids to the sites that a kernel visits: every check of the operators' tensors, and two products.
+"""From cameras and grids to the sites that a kernel visits, with all checks of the operators' tensors.
 
-The matrices are composed in float64. Nothing below this module knows cameras or grids, nothing above composes matrices.
+The matrices are composed in float64, only here. Nothing below this module knows cameras or grids.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def image_sites(
     view_mask: Tensor | None,
     options: Options,
 ) -> Sites:
-    """The sites of a grid as the views' images see them, everything checked."""
+    """The checked sites of a grid in the views' images."""
     lattice = _lattice(who, grid, features)
     matrices = image_matrices(who, features, cameras, view_mask)
     T, x, y, z, projective = lattice
@@ -98,7 +98,7 @@ def sweep_sites(
     view_mask: Tensor | None,
     options: Options,
 ) -> Sites:
-    """The sites of the views' frustums as a volume sees them, everything checked."""
+    """The checked sites of the views' frustums in a volume."""
     check_float(who, "volume", volume, "(B, C, D, H, W)", rank=5)
     if not isinstance(grid, VoxelGrid):
         raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")

@@ -42,7 +42,7 @@ def is_jit_traced() -> bool:
 
 
 def as_constant(function: Function) -> Function:
-    """Have torch.compile call a function while it traces, and take the answer as a constant.
+    """Have torch.compile call a function while it traces, and treat the result as a constant.
 
     `torch.compiler.assume_constant_result` also imports dynamo, which takes seconds.
     """

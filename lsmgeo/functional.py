@@ -99,8 +99,8 @@ def unproject(
 
     Returns:
         ``volume`` (B, V, C', D, H, W), or (B, C'', D, H, W) with `reduce`; C' is C plus 1 for depth plus 3 for
-        direction, C'' is C' for each statistic in the order asked; and ``visible`` (B, V, D, H, W) bool. Differentiable
-        in features, K, R, t, the grid's pose, its camera and its depths.
+        direction, C'' is C' for each statistic in the order requested; and ``visible`` (B, V, D, H, W) bool.
+        Differentiable in features, K, R, t, the grid's pose, its camera and its depths.
 
     Raises:
         ShapeError, DTypeError, DeviceError, CameraError, GridError, OptionError: see `lsmgeo.errors`.
@@ -145,7 +145,7 @@ def unproject_slabs(
     near: float = 1e-6,
     backend: str = "auto",
 ) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """`unproject` for grids too large for memory: one slab of planes along the grid's first axis after another.
+    """`unproject` for grids too large for memory: slab by slab along the grid's first axis.
 
     Args:
         features: (B, V, C, h, w).
@@ -162,7 +162,7 @@ def unproject_slabs(
         backend: see `unproject`.
 
     Yields:
-        ``(start, volume, visible)``: what `unproject` gives at planes start to start + planes, to the last bit.
+        ``(start, volume, visible)``: what `unproject` returns at planes start to start + planes, bit for bit.
 
     Raises:
         ShapeError, DTypeError, DeviceError, CameraError, GridError, OptionError: at the call, before the first slab.
@@ -268,7 +268,7 @@ def sample_views(
     near: float = 1e-6,
     backend: str = "auto",
 ) -> Unprojected:
-    """`unproject` after the projection, for cameras that are no matrix: fisheye, distorted, panoramic.
+    """`unproject` at given pixels, for cameras that are not a matrix: fisheye, distorted, panoramic.
 
     Args:
         features: (B, V, C, h, w).
@@ -277,7 +277,7 @@ def sample_views(
         valid: (B, V, N) bool; where it is False nothing is read and all channels are 0.
         mode: "bilinear" or "nearest".
         padding_mode: "zeros" or "border".
-        augment: "depth" to append the depth. (There is no matrix to take a ray direction from.)
+        augment: "depth" to append the depth. (Ray directions need a camera matrix.)
         reduce: as in `unproject`.
         near: least depth of a visible site, world units.
         backend: as in `unproject`.
@@ -314,8 +314,7 @@ def sample_views(
         finite = pixels.isfinite().all(-1) & depth.isfinite()
         if not bool((finite | ~valid).all()):
             raise GridError(f"{who}: pixels and depth must be finite where valid")
-    arguments = (pixels, depth, valid)
-    return Unprojected(*kernels.run("sample_views", features, *arguments, options=options))
+    return Unprojected(*kernels.run("sample_views", features, pixels, depth, valid, options=options))
 
 
 def plane_sweep_project(
@@ -348,7 +347,7 @@ def plane_sweep_project(
         cameras: B*V cameras, view fastest: a kornia ``PinholeCamera`` or ``PinholeCamerasList``, or `CameraTensors`.
         grid: the `VoxelGrid` on which the volume lives.
         depths: (P,), (B, P) or (B, V, P) camera z in world units, positive, strictly ascending, float32 or float64.
-        size: (h, w) of the maps; by default the cameras' image size, which must then be one.
+        size: (h, w) of the maps; by default the cameras' image size, which all must then share.
         view_mask: (B, V) bool; views where it is False give zeros and are unread.
         mode: "trilinear", or "nearest": the voxel that contains the sample.
         padding_mode: "zeros" or "border".
@@ -407,7 +406,7 @@ def view_statistics(volume: Tensor, visible: Tensor, statistics: Names, view_mas
         view_mask: (B, V) bool; views where it is False do not count.
 
     Returns:
-        (B, C'', ...): blocks of C channels in the order asked; 0 where no view sees the site.
+        (B, C'', ...): blocks of C channels in the order requested; 0 where no view sees the site.
 
     Raises:
         ShapeError, DTypeError, DeviceError, OptionError: see `lsmgeo.errors`.

@@ -1,7 +1,7 @@
 """Fusion of views: modules of one protocol, from per-view volumes to one.
 
-Each takes ``(volume (B, V, C, *sites), visible (B, V, *sites), view_mask (B, V) or None)`` and gives (B, C, *sites),
-with any number of views and ragged scenes. The recurrent ones learn, and also give the state after every view.
+Each maps ``(volume (B, V, C, *sites), visible (B, V, *sites), view_mask (B, V) or None)`` to (B, C, *sites),
+with any number of views and ragged scenes. The recurrent ones have weights, and also return the state after every view.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def _odd(who: str, name: str, value: int) -> int:
 
 
 class _Recurrent(nn.Module):
-    """What the recurrent fusions share: the loop over views, and parts that hold the weights of one step.
+    """The loop over views that the recurrent fusions share; subclasses hold the weights of one step.
 
     The convolution over [input, state] is the sum of one over the input, which is computed for all views at once, and
     one over the state. The first state is 0, so that the first view needs no convolution of it.
@@ -101,7 +101,7 @@ class _Recurrent(nn.Module):
         )
         self.norm = check_flag(who, "norm", norm)
         self.eps = check_number(who, "eps", eps, "a small number")
-        # A norm takes a bias out again.
+        # A norm cancels a bias.
         self.input = nn.Conv3d(
             self.in_channels,
             self.parts * self.hidden_channels,
@@ -113,7 +113,7 @@ class _Recurrent(nn.Module):
         self._initialise()
 
     def _build(self) -> None:
-        """Make the parts that are a recurrence's own: what works on the state, and its norms."""
+        """Create the layers that depend on the recurrence: the convolutions over the state, and the norms."""
         raise NotImplementedError
 
     def _of_state(self, parts: int) -> nn.Conv3d:
@@ -149,7 +149,7 @@ class _Recurrent(nn.Module):
         if view_mask is not None:
             check_mask(who, "view_mask", view_mask, (B, V), "(B, V)")
             check_devices(who, volume=volume, view_mask=view_mask)
-            # Not by the choice between states alone: 0 times a NaN in backward is a NaN in the weights.
+            # Selecting between states is not enough: 0 times a NaN in backward is a NaN in the weights.
             volume = torch.where(view_mask[:, :, None, None, None, None], volume, 0.0)
         inputs = self.input(volume.flatten(0, 1)).unflatten(0, (B, V))
         outputs: list[Tensor] = []
@@ -169,8 +169,8 @@ class _Recurrent(nn.Module):
 
         Args:
             volume: (B, V, C, D, H, W), V at least 1.
-            visible: taken for the protocol, not used: what is invisible is 0 in the volume already.
-            view_mask: (B, V) bool; a masked view is not read, and the state before it stays.
+            visible: part of the protocol, not used: invisible sites are 0 in the volume already.
+            view_mask: (B, V) bool; a masked view is not read and does not change the state.
 
         Returns:
             (B, V, C', D, H, W).
@@ -193,7 +193,7 @@ class _Recurrent(nn.Module):
 
 
 class ConvGRU3d(_Recurrent):
-    """Fuse views one after the other with a gated recurrent unit of 3D convolutions.
+    """Fuse views in sequence with a gated recurrent unit of 3D convolutions.
 
     Equation: with * a convolution, LN layer normalisation over channels and voxels with a gain and a shift a channel,
     x a view's volume and h the state, 0 before the first view: ``r = sigmoid(LN(W_r * [x, h]))``,
@@ -213,7 +213,7 @@ class ConvGRU3d(_Recurrent):
         - result: (B, C', D, H, W) in [-1, 1]; `states` gives (B, V, C', D, H, W), the state after every view.
 
     Raises:
-        OptionError: an option that is none.
+        OptionError: an invalid option.
 
     Example:
         >>> import torch
@@ -247,7 +247,7 @@ class ConvGRU3d(_Recurrent):
 
 
 class ConvLSTM3d(_Recurrent):
-    """Fuse views one after the other with a long short-term memory of 3D convolutions.
+    """Fuse views in sequence with a long short-term memory of 3D convolutions.
 
     Equation: with * a convolution, LN layer normalisation over channels and voxels with a gain and a shift a channel,
     x a view's volume, h the output and m the memory, both 0 before the first view: ``g, i, f, o = LN(W * [x, h])``,
@@ -267,7 +267,7 @@ class ConvLSTM3d(_Recurrent):
         - result: (B, C', D, H, W) in [-1, 1]; `states` gives (B, V, C', D, H, W), the output after every view.
 
     Raises:
-        OptionError: an option that is none.
+        OptionError: an invalid option.
 
     Example:
         >>> import torch

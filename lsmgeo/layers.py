@@ -25,7 +25,7 @@ class SamplingLayer(nn.Module):
     """A layer whose options are checked once, at construction.
 
     Attributes:
-        options: the checked options, which `forward` hands down.
+        options: the checked options, which `forward` passes on.
         given: the options as given, by name.
     """
 
@@ -49,7 +49,7 @@ class Unproject(SamplingLayer):
     """Lift image features to the sites of a grid; see `lsmgeo.functional.unproject` for equation and conventions.
 
     Args:
-        grid: `VoxelGrid` or `FrustumGrid`; None if every call brings its own. Not part of the ``state_dict``.
+        grid: `VoxelGrid` or `FrustumGrid`; None if it is passed to every call. Not part of the ``state_dict``.
         mode: "bilinear" or "nearest".
         padding_mode: "zeros" or "border".
         augment: "depth", "direction" or both: channels to append, depth first.
@@ -108,7 +108,7 @@ class Unproject(SamplingLayer):
     def forward(
         self, features: Tensor, cameras: Cameras, view_mask: Tensor | None = None, *, grid: Grid | None = None
     ) -> Unprojected:
-        """Unproject features (B, V, C, h, w); `grid` takes the place of the layer's."""
+        """Unproject features (B, V, C, h, w); `grid` takes precedence over the layer's."""
         grid = self.grid if grid is None else grid
         if grid is None:
             raise GridError("Unproject: grid must be given to the layer or to the call; got None")
@@ -123,8 +123,8 @@ class PlaneSweepProject(SamplingLayer):
     """Read a volume along the rays of cameras at planes of depth; see `lsmgeo.functional.plane_sweep_project`.
 
     Args:
-        grid: the `VoxelGrid` on which the volumes live; None if every call brings its own.
-        depths: (P,), (B, P) or (B, V, P), see `lsmgeo.depth_planes`; None if every call brings its own. Neither is part
+        grid: the `VoxelGrid` on which the volumes live; None if it is passed to every call.
+        depths: (P,), (B, P) or (B, V, P), see `lsmgeo.depth_planes`; None if passed to every call. Neither is part
             of the ``state_dict``; both follow the volume's device.
         size: (h, w) of the maps; by default the cameras' image size.
         mode: "trilinear" or "nearest".
@@ -201,7 +201,7 @@ class PlaneSweepProject(SamplingLayer):
         depths: Tensor | None = None,
         size: tuple[int, int] | None = None,
     ) -> Projected:
-        """Sweep a volume (B, C, D, H, W); `grid`, `depths` and `size` take the place of the layer's."""
+        """Sweep a volume (B, C, D, H, W); `grid`, `depths` and `size` take precedence over the layer's."""
         grid = self.grid if grid is None else grid
         if grid is None:
             raise GridError("PlaneSweepProject: grid must be given to the layer or to the call; got None")

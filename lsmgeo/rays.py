@@ -1,7 +1,7 @@
-"""Reductions of a swept volume along its rays: what turns planes into maps.
+"""Reductions of a swept volume along its rays, from planes to maps.
 
-A swept volume is (..., P, h, w) or (..., C, P, h, w) with the planes in ascending depth, as
-``plane_sweep_project(..., flatten=False)`` gives it.
+A swept volume is (..., P, h, w) or (..., C, P, h, w) with the planes in ascending depth, as returned by
+``plane_sweep_project(..., flatten=False)``.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def expected_depth(scores: Tensor, depths: Tensor, visible: Tensor | None = None
     Stereo Regression", 2017, section 3.4).
 
     Args:
-        scores: (..., P, h, w); larger means likelier.
+        scores: (..., P, h, w); larger is more likely.
         depths: (P,) or (..., P), world units.
         visible: bool, broadcasts to the scores; samples where it is False have no weight.
 
@@ -99,7 +99,7 @@ def expected_depth(scores: Tensor, depths: Tensor, visible: Tensor | None = None
         return saturating_cast((computing.softmax(-3) * planes).sum(-3), scores.dtype)
     seen = visible.expand(scores.shape)
     any_seen = seen.any(-3, keepdim=True)
-    # Rays with no sample get even weights, which are then dropped: a softmax over nothing is NaN.
+    # Rays with no visible sample get equal weights, which are then dropped: a softmax over no samples is NaN.
     hidden = torch.where(any_seen, -torch.inf, 0.0).to(planes.dtype)
     weights = torch.where(seen, computing, hidden).softmax(-3)
     return saturating_cast(torch.where(any_seen.squeeze(-3), (weights * planes).sum(-3), 0.0), scores.dtype)
@@ -136,7 +136,7 @@ def max_along_rays(maps: Tensor, visible: Tensor | None = None) -> Tensor:
 
 
 class Composited(NamedTuple):
-    """Values and depth seen along rays, what is left of the light behind, and the weight of each sample."""
+    """Composited values and depth, the transmittance behind the last plane, and the weight of each sample."""
 
     values: Tensor
     depth: Tensor
@@ -238,7 +238,7 @@ def project_reduce(
         backend: see there.
 
     Returns:
-        ``maps`` (B, V, O, h, w) and ``visible`` (B, V, P, h, w). Differentiable in everything real.
+        ``maps`` (B, V, O, h, w) and ``visible`` (B, V, P, h, w). Differentiable in every real argument.
 
     Raises:
         ShapeError, DTypeError, DeviceError, CameraError, GridError, OptionError: see `lsmgeo.errors`.
@@ -382,7 +382,7 @@ class ProjectReduce(SamplingLayer):
         *,
         size: tuple[int, int] | None = None,
     ) -> Projected:
-        """Sweep and reduce a volume (B, C, D, H, W); `size` takes the place of the layer's."""
+        """Sweep and reduce a volume (B, C, D, H, W); `size` takes precedence over the layer's."""
         device = volume.device if isinstance(volume, Tensor) else self.depths.device
         depths = moved("ProjectReduce", "depths", self.depths, device)
         size = self.size if size is None else size

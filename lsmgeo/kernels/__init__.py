@@ -83,7 +83,7 @@ def run(operator: str, source: Tensor, *arguments: Any, options: Options) -> Any
 
 
 def _differentiable(operator: str, arguments: tuple[Any, ...], options: Options) -> tuple[Any, ...]:
-    """The arguments, detached where the answer has no derivative: the nearest cell has none by the geometry."""
+    """The arguments, detached where there is no derivative: nearest sampling has none to the geometry."""
     nearest, appended = options.mode == "nearest", options.appended() > 0
     if operator == "sample_views":
         pixels, depth, valid = arguments

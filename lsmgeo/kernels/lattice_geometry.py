@@ -12,29 +12,7 @@ from torch import Tensor
 
 from lsmgeo.kernels.request import Options, Sites
 
-__all__ = [
-    "LARGEST_COORDINATE",
-    "OUTSIDE",
-    "lattice_directions",
-    "lattice_extent",
-    "lattice_rows",
-    "mask_views",
-    "per_view",
-    "perspective_division",
-    "pixels_in_front",
-    "plane_rows",
-    "point_directions",
-    "point_extent",
-    "point_rows",
-    "power_of_two_above",
-    "project_points",
-    "recenter",
-    "recentered_matrix",
-    "scale_below_overflow",
-    "unit_vectors",
-]
-
-# Sites are sent here to read nothing: every tap is outside the array, for any interpolation.
+# The index of sites that read nothing: every tap is outside the array, for any interpolation.
 OUTSIDE = -2.0
 # Homogeneous coordinates are kept below 2^100, and a site counts as in front only beyond 2^-60, so that neither the
 # quotient's derivative nor anything before it overflows in float32.
@@ -95,7 +73,7 @@ def point_extent(matrix: Tensor, points: Tensor) -> Tensor:
 
 
 def scale_below_overflow(extent: Tensor) -> Tensor:
-    """A factor 2^-k that brings `extent` to `LARGEST_COORDINATE` at most, 1 where it is small already."""
+    """A factor 2^-k that brings `extent` to `LARGEST_COORDINATE` at most, 1 where it is smaller."""
     return torch.exp2(-torch.log2(extent.clamp_min(LARGEST_COORDINATE) / LARGEST_COORDINATE).ceil())
 
 
@@ -116,7 +94,7 @@ def lattice_directions(sites: Sites, dtype: torch.dtype) -> Tensor:
     """Unit ray directions at the sites of a lattice, (B, V, 3, D, H, W)."""
     assert sites.direction is not None
     matrix = sites.direction / power_of_two_above(sites.direction.detach().abs().amax((-1, -2)))[..., None, None]
-    # Bounded plane by plane, so that the planes of a slab come out as those of the whole.
+    # Bounded plane by plane, so that a slab has the same directions as the whole.
     z = per_view(sites.z.detach(), matrix).abs()
     terms = _extent(matrix[:, :, None], (sites.x.abs().amax(0), sites.y.abs().amax(0), z))[..., None, None]
     return unit_vectors(lattice_rows(matrix, sites, dtype), terms, sites.view_mask)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import product
 from typing import Any
 
 import torch
@@ -18,19 +19,18 @@ LARGEST_TILE = {"cpu": 16 << 20, "triton": 256 << 20}  # bytes
 LEAST_TILES = 32
 
 
-def _channels_adjacent(volume: Tensor) -> Tensor:
-    """The volume with adjacent channels, so that no tile copies it again."""
-    return volume if volume.stride(1) == 1 else volume.movedim(1, -1).contiguous().movedim(-1, 1)
-
-
-def _tiles(sites: Sites, weight: Tensor, backend: str) -> list[tuple[int, int, slice]]:
-    """Scenes, views and rows of the maps whose stacked channels are in memory at one time."""
+def _tiles(
+    volume: Tensor, weight: Tensor, sites: Sites, backend: str
+) -> Iterator[tuple[int, int, slice, Sites, Tensor]]:
+    """Scene, view, rows of the maps, their sites, and memory (pixels, planes * channels) for their stacked channels."""
     (B, V), (_, channels, planes), (_, height, width) = sites.matrix.shape[:2], weight.shape, sites.counts()
     row = max(1, 4 * channels * planes * width)
     most = min(LARGEST_TILE[backend], B * V * height * row // LEAST_TILES)
     step = min(max(1, most // row), max(1, height))
-    blocks = [slice(start, min(start + step, height)) for start in range(0, height, step)]
-    return [(b, v, rows) for b in range(B) for v in range(V) for rows in blocks]
+    memory = volume.new_empty((step * width, planes * channels), dtype=torch.float32)
+    for b, v, start in product(range(B), range(V), range(0, height, step)):
+        rows = slice(start, min(start + step, height))
+        yield b, v, rows, _tile_sites(sites, b, v, rows), memory[: (rows.stop - start) * width]
 
 
 def _tile_sites(sites: Sites, b: int, v: int, rows: slice) -> Sites:
@@ -58,10 +58,10 @@ def _linear_map(weight: Tensor, bias: Tensor | None) -> tuple[Tensor, Tensor]:
 def _can_saturate(
     dtype: torch.dtype, volume: Tensor, sites: Sites, matrix: Tensor, offset: Tensor, options: Options
 ) -> bool:
-    """Whether maps may exceed their dtype; where they do is then found by computing them again."""
+    """Whether maps may exceed their dtype; backward then recomputes them to find where they do."""
     if dtype == torch.float32 or not offset.numel():
         return False
-    if volume.device.type != "cpu":  # reading numbers would make it wait; bfloat16 has the range of float32
+    if volume.device.type != "cpu":  # reading values would synchronise; bfloat16 has the range of float32
         return dtype == torch.float16
     channels = [volume.new_ones(1)]  # those of a direction
     if volume.numel():
@@ -76,7 +76,7 @@ def project_reduce(
     kernels: Any, volume: Tensor, weight: Tensor, bias: Tensor | None, sites: Sites, options: Options
 ) -> tuple[Tensor, Tensor]:
     """As `reference.project_reduce`, by these kernels' `plane_sweep_project`."""
-    volume = _channels_adjacent(volume)
+    volume = library.channels_last(volume, 1)  # copied once, not for each tile
     (B, V), (P, h, w), outputs = sites.matrix.shape[:2], sites.counts(), weight.shape[0]
     if kernels is library:
         maps = library.empty((B, V, outputs, h, w), volume.dtype, (0, 1, 3, 4, 2))
@@ -84,17 +84,12 @@ def project_reduce(
         maps = volume.new_empty((B, V, h, w, outputs)).movedim(-1, 2)
     visible = volume.new_empty((B, V, P, h, w), dtype=torch.bool)
     matrix, offset = _linear_map(weight, bias)
-    memory = None
     with torch.autocast(volume.device.type, enabled=False):
-        for b, v, rows in _tiles(sites, weight, options.backend):
-            pixels = (rows.stop - rows.start) * w
-            if memory is None:
-                memory = volume.new_empty((pixels, matrix.shape[0]), dtype=torch.float32)
-            tile = memory[:pixels]
+        for b, v, rows, part, tile in _tiles(volume, weight, sites, options.backend):
             _, visible[b : b + 1, v : v + 1, :, rows] = kernels.plane_sweep_project(
-                volume[b : b + 1], _tile_sites(sites, b, v, rows), options, _unstacked(tile, weight, w)
+                volume[b : b + 1], part, options, _unstacked(tile, weight, w)
             )
-            target = maps[b, v, :, rows].permute(1, 2, 0).view(pixels, outputs)
+            target = maps[b, v, :, rows].permute(1, 2, 0).view(tile.shape[0], outputs)
             if target.dtype == torch.float32:
                 torch.addmm(offset, tile, matrix, out=target)
             else:
@@ -113,7 +108,7 @@ def project_reduce_backward(
     needs: Sequence[bool],
 ) -> tuple[Tensor | None, ...]:
     """Gradients to volume, weight, bias, matrix, direction and z; None where not needed."""
-    original, volume = volume, _channels_adjacent(volume)
+    original, volume = volume, library.channels_last(volume, 1)
     (B, V), (P, _, w), outputs = sites.matrix.shape[:2], sites.counts(), weight.shape[0]
     matrix, offset = _linear_map(weight, bias)
     saturates = _can_saturate(gradient.dtype, volume, sites, matrix, offset, options)
@@ -124,15 +119,10 @@ def project_reduce_backward(
     to_sites = [sites.matrix.new_zeros(shape) for shape in ((B, V, 3, 4), (B, V, 3, 4), (B, V, P))]
     to_matrix = torch.zeros_like(matrix) if needs[1] else None
     to_bias = torch.zeros_like(offset) if needs[2] else None
-    memory = None
     with torch.autocast(volume.device.type, enabled=False):
-        for b, v, rows in _tiles(sites, weight, options.backend):
-            pixels, part = (rows.stop - rows.start) * w, _tile_sites(sites, b, v, rows)
-            if memory is None:
-                memory = volume.new_empty((pixels, matrix.shape[0]), dtype=torch.float32)
-            tile = memory[:pixels]
+        for b, v, rows, part, tile in _tiles(volume, weight, sites, options.backend):
             scene, swept = volume[b : b + 1], _unstacked(tile, weight, w)
-            incoming = gradient[b, v, :, rows].permute(1, 2, 0).reshape(pixels, outputs).float()
+            incoming = gradient[b, v, :, rows].permute(1, 2, 0).reshape(tile.shape[0], outputs).float()
             if to_matrix is not None or saturates:
                 kernels.plane_sweep_project(scene, part, options, swept)
             if saturates:

@@ -1,6 +1,6 @@
 """The reference kernels: vectorised PyTorch, differentiable in everything, twice. The yardstick for all others.
 
-This module alone knows `grid_sample` and its `align_corners`.
+Only this module knows `grid_sample` and its `align_corners`.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _sample(source: Tensor, index: Sequence[Tensor], front: Tensor, options: Opt
     visible = reduce(torch.logical_and, inside)
     grid = torch.stack([_coordinate(axis, size, options) for axis, size in zip(index, sizes, strict=True)], -1)
     grid = grid.flatten(0, 1)
-    if len(sizes) == 2:  # grid_sample wants as many axes of sites as the source has
+    if len(sizes) == 2:  # grid_sample requires as many axes of sites as the source has
         grid = grid.flatten(1, -3) if grid.dim() > 3 else grid[:, None]
     values = grid_sample(
         source.flatten(0, 1),
@@ -139,10 +139,12 @@ def _over_pieces(
     options: Options,
     dtype: torch.dtype,
 ) -> tuple[Tensor, Tensor]:
-    """Statistics over the views of `piece(start, stop, *inputs)`, one piece of the sites' first axis after another.
+    """`piece(start, stop, *inputs)` over all `total` sites of the first axis, reduced over the views if requested.
 
-    The values of all views exist for one piece at a time; in backward they are made again.
+    With a reduction the values of all views exist for one piece of the axis at a time; backward recomputes them.
     """
+    if not options.reduce:
+        return piece(0, total, *inputs)
 
     def reduced(start: int, stop: int, *inputs: Tensor | None) -> tuple[Tensor, Tensor]:
         values, visible = piece(start, stop, *inputs)
@@ -183,8 +185,8 @@ def unproject(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, T
         vectors = lattice_directions(part, dtype) if options.direction else None
         return _output(values, depth, vectors, dtype if options.reduce else output), visible
 
-    total, inputs = sites.z.shape[-1], (source, sites.matrix, sites.direction, sites.z)
-    return _over_pieces(piece, total, inputs, options, output) if options.reduce else piece(0, total, *inputs)
+    inputs = source, sites.matrix, sites.direction, sites.z
+    return _over_pieces(piece, sites.z.shape[-1], inputs, options, output)
 
 
 def unproject_points(
@@ -212,8 +214,7 @@ def unproject_points(
             vectors = point_directions(direction, points, slice(start, stop), view_mask, dtype)
         return _output(values, depth, vectors, dtype if options.reduce else output), visible
 
-    total, inputs = points.shape[1], (source, matrix, direction, points)
-    return _over_pieces(piece, total, inputs, options, output) if options.reduce else piece(0, total, *inputs)
+    return _over_pieces(piece, points.shape[1], (source, matrix, direction, points), options, output)
 
 
 def sample_views(
@@ -236,14 +237,13 @@ def sample_views(
         distance = torch.where(domain, distance, 0.0)
         return _output(values, distance if options.depth else None, None, dtype if options.reduce else output), visible
 
-    total, inputs = pixels.shape[2], (source, pixels, depth)
-    return _over_pieces(piece, total, inputs, options, output) if options.reduce else piece(0, total, *inputs)
+    return _over_pieces(piece, pixels.shape[2], (source, pixels, depth), options, output)
 
 
 def sample_pixels(
     source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options
 ) -> tuple[Tensor, Tensor]:
-    """What the fused kernels do with pixels, in the reference's operations: the second derivatives come from here.
+    """What the fused kernels compute for pixels, in the reference's operations: for second derivatives.
 
     Args:
         source: (B, V, C, h, w).
@@ -272,7 +272,7 @@ def _sweep(source: Tensor, sites: Sites, options: Options, output: torch.dtype) 
     front = depth > options.near
     if sites.view_mask is not None:
         front = front & sites.view_mask[..., None]
-    # M q / s = depth (M_x x + M_y y + M_1) + M_z. Planes to leave out are sent outside along the line, at no cost.
+    # M q / s = depth (M_x x + M_y y + M_1) + M_z. Planes not in front get an index outside the volume.
     plane = plane_rows(m, sites).clamp(-LARGEST_COORDINATE, LARGEST_COORDINATE)
     reach = torch.where(front, depth, 0.0)[..., None, None]
     offset = torch.where(front[:, :, None], m[..., 2, None], OUTSIDE)[..., None, None]  # (B, V, 3, P, 1, 1)

@@ -72,7 +72,7 @@ def _channels_last(like: Tensor, shape: Sequence[int], axis: int) -> Tensor:
 
 
 def _tensors(gradient: Tensor, found: Sequence[Tensor | None], needs: Sequence[bool]) -> tuple[Tensor, ...]:
-    """An operator cannot answer None: an empty tensor stands for a gradient that is not needed."""
+    """The gradients, with an empty tensor for each that is not needed: an operator cannot return None."""
     pairs = zip(found, needs, strict=True)
     return tuple(gradient.new_empty(0) if part is None or not need else part for part, need in pairs)
 
@@ -93,7 +93,7 @@ def _empty_at_sites(
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-    """Keep the arguments, and nothing of the size of the answer, which backward computes again."""
+    """Save the arguments; backward recomputes the rest, so that nothing of the output's size is kept."""
     ctx.save_for_backward(*(value if isinstance(value, Tensor) else None for value in inputs))
     ctx.others = [None if isinstance(value, Tensor) else value for value in inputs]
 
@@ -139,7 +139,7 @@ def _shared(gradient: Tensor | None, z: Tensor) -> Tensor | None:
     return gradient.sum((0, 1)) if z.dim() == 1 else gradient.sum(1)
 
 
-# Operators: each has its kernels' forward and backward, empty answers of both for tracing, and what autograd calls
+# Operators: forward and backward of the kernels, fake versions of both for tracing, and the autograd rule
 
 
 class _Unproject:
@@ -296,7 +296,7 @@ for _operator in (_Unproject(), _SampleViews(), _PlaneSweepProject(), _ProjectRe
     ):
         _library.impl(_full_name, _run, "CompositeExplicitAutograd")
         torch.library.register_fake(f"lsmgeo::{_full_name}", _fake, lib=_library)
-        for _device in ("CPU", "CUDA"):  # under autocast too: arithmetic is in float32, answers have the source's dtype
+        for _device in ("CPU", "CUDA"):  # arithmetic is in float32 under autocast too
             _library.impl(_full_name, torch.library.fallthrough_kernel, f"Autocast{_device}")
     torch.library.register_autograd(f"lsmgeo::{_name}", _operator.autograd, setup_context=_save, lib=_library)
 
@@ -304,32 +304,21 @@ for _operator in (_Unproject(), _SampleViews(), _PlaneSweepProject(), _ProjectRe
 # The operators of a backend, as `lsmgeo.kernels` calls them
 
 
-def _unproject(backend: str, features: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
-    return torch.ops.lsmgeo.unproject(features, *sites, *options.on(backend))
+def _at_sites(operator: Callable[..., Any], backend: str, source: Tensor, sites: Sites, *rest: Any) -> Any:
+    *tensors, options = rest
+    return operator(source, *tensors, *sites, *options.on(backend))
 
 
-def _sample_pixels(
-    project: Callable[..., Any], backend: str, features: Tensor, *arguments: Any
-) -> tuple[Tensor, Tensor]:
+def _at_pixels(project: Callable[..., Any], backend: str, features: Tensor, *arguments: Any) -> Any:
     return torch.ops.lsmgeo.sample_views(features, *project(*arguments), *arguments[-1].on(backend))
-
-
-def _plane_sweep_project(backend: str, volume: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
-    return torch.ops.lsmgeo.plane_sweep_project(volume, *sites, *options.on(backend))
-
-
-def _project_reduce(
-    backend: str, volume: Tensor, sites: Sites, weight: Tensor, bias: Tensor | None, options: Options
-) -> tuple[Tensor, Tensor]:
-    return torch.ops.lsmgeo.project_reduce(volume, weight, bias, *sites, *options.on(backend))
 
 
 def operators(backend: str) -> dict[str, Callable[..., Any]]:
     """The operators run by the kernels of this name."""
     return {
-        "unproject": partial(_unproject, backend),
-        "unproject_points": partial(_sample_pixels, project_points, backend),
-        "sample_views": partial(_sample_pixels, pixels_in_front, backend),
-        "plane_sweep_project": partial(_plane_sweep_project, backend),
-        "project_reduce": partial(_project_reduce, backend),
+        "unproject": partial(_at_sites, torch.ops.lsmgeo.unproject, backend),
+        "unproject_points": partial(_at_pixels, project_points, backend),
+        "sample_views": partial(_at_pixels, pixels_in_front, backend),
+        "plane_sweep_project": partial(_at_sites, torch.ops.lsmgeo.plane_sweep_project, backend),
+        "project_reduce": partial(_at_sites, torch.ops.lsmgeo.project_reduce, backend),
     }

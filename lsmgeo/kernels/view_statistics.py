@@ -25,21 +25,21 @@ def view_statistics(values: Tensor, visible: Tensor, statistics: Sequence[str]) 
         statistics: names out of "mean", "variance" (mean of squares about the mean) and "max".
 
     Returns:
-        (B, len(statistics) * C, ...), blocks of channels in the order asked, 0 where no view sees the site. Never more
-        than the dtype's largest finite value.
+        (B, len(statistics) * C, ...), blocks of channels in the order requested, 0 where no view sees the site, at most
+        the dtype's largest finite value.
     """
     seen = visible[:, :, None]  # (B, V, 1, ...)
     share = 1.0 / visible.sum(1, dtype=values.dtype).clamp_min(1.0)[:, None]  # (B, 1, ...)
     largest = torch.finfo(values.dtype).max
     kept = torch.where(seen, values, 0.0)
     blocks = []
-    # Shares are taken before the sum, so that the mean of large finite numbers does not overflow.
+    # Divided before the sum, so that the mean of large finite numbers does not overflow.
     mean = (kept * share[:, None]).sum(1) if "mean" in statistics or "variance" in statistics else kept
     for name in statistics:
         if name == "mean":
             blocks.append(mean)
         elif name == "variance":
-            # Held where its square would overflow.
+            # Clamped where its square would overflow.
             deviation = torch.where(seen, kept - mean[:, None], 0.0).clamp(-(largest**0.5), largest**0.5)
             blocks.append((deviation.square() * share[:, None]).sum(1).clamp(max=largest))
         else:

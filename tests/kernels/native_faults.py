@@ -22,7 +22,7 @@ FAULTS = {
     "floor for nearest": ("nearest && fraction >= 0.5f ? $floor + 1.0f$ : floor", "floor"),
     "closed image": ("int32_t($index < size - 0.5f$)", "index < size + 0.5f"),
     "border always": ("border = $call.border != 0$;", "true"),
-    "slope beyond the border": ("$index > 0.0f && index < size - 1.0f ? 1.0f : 0.0f$", "1.0f"),
+    "slope beyond the border": ("$!border || (index > 0.0f && index < size - 1.0f) ? 1.0f : 0.0f$;", "1.0f"),
     "weights of x and y swapped": ("tile.weight[1][s] = $x * near$;", "(1.0f - x) * next"),
     "last tap dropped": ("tile.weight[7][s] = $x * y * z$;", "0.0f"),
     "edge taps not weighted": ("const float weight = $tap_weight<DIMS>(tile, s, tap) * factor$;", "factor"),
@@ -45,8 +45,8 @@ FAULTS = {
         "0.0",
     ),
     "direction's slope not projected": (
-        "($grad_direction[row][s] - along * tile.direction[row][s]$)",
-        "grad_direction[row][s]",
+        "($site.grad_direction[row][s] - along * tile.direction[row][s]$)",
+        "site.grad_direction[row][s]",
     ),
     "direction not normalised": (
         "tile.inverse_length[s] = $away ? 1.0f / std::sqrt(away ? squares : 1.0f) : 0.0f$;",

@@ -1,6 +1,6 @@
 """Realistic faults in the Triton kernels, as changes of their text: each must be noticed by a comparison.
 
-A fault is loaded as a module of its own, into which `gpu` looks for as long as the comparison lasts.
+A fault is loaded as its own module, which `launcher` and `operators` use during the comparison.
 """
 
 from __future__ import annotations
@@ -61,19 +61,19 @@ CHANGES = {
     ),
     "the lower cell for the nearest": Fault(KERNELS, "index - cell >= 0.5", "index - cell >= 1.5", "masked"),
     "no test of what is in front": Fault(
-        KERNELS, "front = kept & (third > tl.maximum(near * unit, SMALLEST_DEPTH))", "front = kept", "views"
+        KERNELS, "front = unmasked & (height > tl.maximum(near * unit, SMALLEST_DEPTH))", "front = unmasked", "views"
     ),
     "near not in units of depth": Fault(KERNELS, "tl.maximum(near * unit,", "tl.maximum(near,", "views"),
-    "no near plane in sweeps": Fault(KERNELS, "front = kept & (distance > near)", "front = kept", "sweep"),
+    "no near plane in sweeps": Fault(KERNELS, "front = unmasked & (distance > near)", "front = unmasked", "sweep"),
     "depth without s": Fault(KERNELS, "unit = unit * along", "unit = unit * 1.0", "views"),
     "masked views taken in": Fault(
-        KERNELS, "return tl.where(site.keep, tl.load(table + KEPT), 0.0) != 0.0", "return site.keep", "masked"
+        KERNELS, "return tl.where(site.keep, tl.load(table + UNMASKED), 0.0) != 0.0", "return site.keep", "masked"
     ),
     "visible up to the outermost cells' neighbours": Fault(KERNELS, "(index >= -0.5)", "(index >= -1.0)", "zeros"),
     "the weight of another axis": Fault(
         KERNELS,
-        "weight_y = cell.along_y if dy else 1.0 - cell.along_y",
-        "weight_y = cell.along_x if dy else 1.0 - cell.along_x",
+        "weight_y = cell.fraction_y if dy else 1.0 - cell.fraction_y",
+        "weight_y = cell.fraction_x if dy else 1.0 - cell.fraction_x",
         "zeros",
     ),
     "the third axis not sampled": Fault(
@@ -86,30 +86,40 @@ CHANGES = {
         KERNELS, "slope = tl.where((index > 0.0) & (index < size - 1.0), 1.0, 0.0)", "slope = slope", "sweep"
     ),
     "shares of all views": Fault(KERNELS, "count += seen.to(tl.float32)", "count += 1.0", "statistics"),
-    "unseen views in the mean": Fault(KERNELS, "kept = tl.where(seen, values, 0.0)", "kept = values", "statistics"),
+    "unseen views in the mean": Fault(
+        KERNELS, "visible_values = tl.where(seen, values, 0.0)", "visible_values = values", "statistics"
+    ),
     "squares about zero": Fault(
-        KERNELS, "place.visible[:, None], values - mean, 0.0", "place.visible[:, None], values, 0.0", "statistics"
+        KERNELS,
+        "projection.visible[:, None], values - mean, 0.0",
+        "projection.visible[:, None], values, 0.0",
+        "statistics",
     ),
     "the last of equal views": Fault(KERNELS, "(values > best)", "(values >= best)", "ties"),
     "a derivative of the wrong sign": Fault(
         GRADIENTS, "(1.0 if corner // 2 % 2 else -1.0)", "(-1.0 if corner // 2 % 2 else 1.0)", "zeros"
     ),
     "a quotient's derivative of the wrong sign": Fault(
-        GRADIENTS, "gz = -(gx * x + gy * y) * place.inverse", "gz = (gx * x + gy * y) * place.inverse", "zeros"
+        GRADIENTS,
+        "grad_z = -(grad_x * x + grad_y * y) * projection.inverse",
+        "grad_z = (grad_x * x + grad_y * y) * projection.inverse",
+        "zeros",
     ),
-    "directions not normalised in backward": Fault(GRADIENTS, "(gx - along * x) * inverse", "gx * inverse", "views"),
+    "directions not normalised in backward": Fault(
+        GRADIENTS, "(grad_x - along * x) * inverse", "grad_x * inverse", "views"
+    ),
     "half of the variance's derivative": Fault(
-        GRADIENTS, "2.0 * deviation * of_square", "deviation * of_square", "statistics"
+        GRADIENTS, "2.0 * deviation * grad_square", "deviation * grad_square", "statistics"
     ),
     "gradients to views that see nothing": Fault(
-        GRADIENTS, "g = tl.where(place.visible[:, None], g, 0.0)", "g = g", "statistics"
+        GRADIENTS, "grad = tl.where(projection.visible[:, None], grad, 0.0)", "grad = grad", "statistics"
     ),
     "masked depths with a gradient": Fault(
-        GRADIENTS, " & _kept(lattice.views + view * FIELDS, site)", " & site.keep", "masked"
+        GRADIENTS, " & _is_unmasked(lattice.views + view * FIELDS, site)", " & site.keep", "masked"
     ),
     "no gradient through s": Fault(TABLES, "through = -extra[..., 3] / z", "through = through", "views"),
     "a sweep's offset taken for a slope": Fault(
-        TABLES, "_outer_sums(rows, depth, torch.ones_like(depth))", "_outer_sums(rows, depth, depth)", "sweep"
+        TABLES, "_matrix_sums(rows, depth, torch.ones_like(depth))", "_matrix_sums(rows, depth, depth)", "sweep"
     ),
     "depth's gradient left on its inverse": Fault(TABLES, "-along * depth.square()", "-along", "sweep"),
 }
@@ -129,10 +139,10 @@ def _load(name: str, text: str, folder: Path) -> ModuleType:
 
 @contextlib.contextmanager
 def broken(fault: Fault | None) -> Iterator[None]:
-    """Make `gpu` use modules with the fault; modules loaded the same way without one if None."""
+    """Launch modules with the fault; modules loaded the same way without one if None."""
     texts = {name: (FOLDER / f"{name}.py").read_text() for name in (KERNELS, GRADIENTS, TABLES)}
     if fault is not None:
-        assert texts[fault.file].count(fault.text) >= 1, f"not to be found: {fault.text}"
+        assert texts[fault.file].count(fault.text) >= 1, f"not found: {fault.text}"
         texts[fault.file] = texts[fault.file].replace(fault.text, fault.instead)
     names = {name: f"{name}_{next(COUNT)}" for name in texts}
     texts[GRADIENTS] = texts[GRADIENTS].replace(f"lsmgeo.kernels.triton.{KERNELS}", names[KERNELS])

@@ -1,112 +1,107 @@
 // The transposes of forward.h, and the gradients to the geometry. Included by resample.h.
 
-// Gradients to a view's matrices M and G and to z, summed over its sites.
-struct GeometryGradients {
-    double *matrix, *direction, *z;
-};
-
-// From the gradients to the index, (M q) / z for images and (M q) / s for volumes, to the depth and to the direction.
-inline void accumulate_geometry_gradients(const Plan &plan, const Tile &tile, const float (*grad_index)[TILE],
-                                          const float *grad_distance, const float (*grad_direction)[TILE],
-                                          const GeometryGradients &sums) {
-    const Call &call = *plan.call;
-    const View &view = view_of(plan, tile);
-    const int n = int(tile.count);
-    const double y = call.y[tile.j];
-    double grad_z[TILE] = {};  // at each site; depths and slopes may be far apart
-    double extra_z = 0.0;
-    const bool volumes = call.kind == PLANE_SWEEP_PROJECT;
-    if (!volumes) {
-        const double z = plane_z(call, tile, tile.k);
-        const double unit = (call.projective ? z : 1.0) * view.scale;
-        float rows[3][TILE];
-        for (int s = 0; s < n; s++) {
-            rows[0][s] = grad_index[0][s] * tile.inverse[s];
-            rows[1][s] = grad_index[1][s] * tile.inverse[s];
-            rows[2][s] = 0.0f;
-        }
-        for (int s = 0; s < n; s++)
-            if (rows[0][s] != 0.0f || rows[1][s] != 0.0f)
-                rows[2][s] = -(rows[0][s] * tile.index[0][s] + rows[1][s] * tile.index[1][s]);
-        if (call.depth && !view.masked)
-            for (int s = 0; s < n; s++) {
-                const double grad_height = grad_distance[s] / unit;
-                rows[2][s] += float(grad_height);
-                if (call.projective) extra_z -= grad_height * double(tile.distance[s]) * view.scale;
-            }
-        for (int row = 0; row < 3; row++) {
-            float sum = 0.0f, sum_x = 0.0f;
-            for (int s = 0; s < n; s++) {
-                sum += rows[row][s];
-                sum_x += rows[row][s] * tile.x[s];
-            }
-            if (sums.matrix) {
-                double *to = sums.matrix + 4 * row;
-                to[0] += view.scale * double(sum_x);
-                to[1] += view.scale * double(sum) * y;
-                to[2] += view.scale * double(sum) * z;
-                to[3] += view.scale * double(sum);
-            }
-            extra_z += view.matrix[row][2] * double(sum);
-        }
-    } else {
-        for (int row = 0; row < 3; row++) {
-            float sum = 0.0f, sum_x = 0.0f, sum_offset = 0.0f;
-            for (int s = 0; s < n; s++) {
-                const float grad_plane = grad_index[row][s] * tile.depth[s];
-                const float unclamped = std::fabs(tile.plane[row][s]) < LARGEST_COORDINATE ? grad_plane : 0.0f;
-                sum += unclamped;
-                sum_x += unclamped * tile.x[s];
-                sum_offset += grad_index[row][s];
-                grad_z[s] -= double(grad_plane) * tile.plane[row][s] * tile.depth[s];
-            }
-            if (sums.matrix) {
-                double *to = sums.matrix + 4 * row;
-                to[0] += sum_x;
-                to[1] += double(sum) * y;
-                to[2] += sum_offset;
-                to[3] += sum;
-            }
-        }
-        if (call.depth && !view.masked)
-            for (int s = 0; s < n; s++) grad_z[s] -= double(grad_distance[s]) * tile.depth[s] * tile.depth[s];
-    }
-    if (call.direction && !view.masked) {
-        float rows[3][TILE];
-        for (int s = 0; s < n; s++) {
-            float along = 0.0f;
-            for (int row = 0; row < 3; row++) along += grad_direction[row][s] * tile.direction[row][s];
-            for (int row = 0; row < 3; row++)
-                rows[row][s] = (grad_direction[row][s] - along * tile.direction[row][s]) * tile.inverse_length[s];
-        }
-        for (int row = 0; row < 3; row++) {
-            const double inner = view.direction[row][2];
-            double sum = 0.0, sum_x = 0.0, sum_z = 0.0;
-            for (int s = 0; s < n; s++) {
-                sum += rows[row][s];
-                sum_x += double(rows[row][s]) * tile.x[s];
-                sum_z += double(rows[row][s]) * plane_z(call, tile, tile.k + (tile.along_z ? s : 0));
-                grad_z[s] += rows[row][s] * inner;
-            }
-            if (sums.direction) {
-                double *to = sums.direction + 4 * row;
-                to[0] += view.direction_scale * sum_x;
-                to[1] += view.direction_scale * sum * y;
-                to[2] += view.direction_scale * sum_z;
-                to[3] += view.direction_scale * sum;
-            }
-        }
-    }
-    if (sums.z) {
-        sums.z[tile.k] += extra_z;
-        for (int s = 0; s < n; s++) sums.z[tile.k + (tile.along_z ? s : 0)] += grad_z[s];
-    }
-}
-
 // Gradients to the index and to the geometric channels of each site, 0 where these saturate.
 struct SiteGradients {
     float grad_index[3][TILE], grad_distance[TILE], grad_direction[3][TILE];
 };
+
+// Images, index (M q) / (M q)_3: adds to the gradient to M, unless null, and returns that to z.
+inline double accumulate_image_gradients(const Call &call, const View &view, const Tile &tile,
+                                         const SiteGradients &site, double *matrix) {
+    const int n = int(tile.count);
+    const double y = call.y[tile.j], z = plane_z(call, tile, tile.k);
+    const double unit = (call.projective ? z : 1.0) * view.scale;
+    double grad_z = 0.0;
+    float rows[3][TILE];
+    for (int s = 0; s < n; s++) {
+        rows[0][s] = site.grad_index[0][s] * tile.inverse[s];
+        rows[1][s] = site.grad_index[1][s] * tile.inverse[s];
+        rows[2][s] = 0.0f;
+    }
+    for (int s = 0; s < n; s++)
+        if (rows[0][s] != 0.0f || rows[1][s] != 0.0f)
+            rows[2][s] = -(rows[0][s] * tile.index[0][s] + rows[1][s] * tile.index[1][s]);
+    if (call.depth && !view.masked)
+        for (int s = 0; s < n; s++) {
+            const double grad_height = site.grad_distance[s] / unit;
+            rows[2][s] += float(grad_height);
+            if (call.projective) grad_z -= grad_height * double(tile.distance[s]) * view.scale;
+        }
+    for (int row = 0; row < 3; row++) {
+        float sum = 0.0f, sum_x = 0.0f;
+        for (int s = 0; s < n; s++) {
+            sum += rows[row][s];
+            sum_x += rows[row][s] * tile.x[s];
+        }
+        if (matrix) {
+            double *to = matrix + 4 * row;
+            to[0] += view.scale * double(sum_x);
+            to[1] += view.scale * double(sum) * y;
+            to[2] += view.scale * double(sum) * z;
+            to[3] += view.scale * double(sum);
+        }
+        grad_z += view.matrix[row][2] * double(sum);
+    }
+    return grad_z;
+}
+
+// Volumes, index (M q) / s: adds to the gradient to M, unless null, and to that to the z of each site.
+inline void accumulate_volume_gradients(const Call &call, const View &view, const Tile &tile,
+                                        const SiteGradients &site, double *matrix, double *grad_z) {
+    const int n = int(tile.count);
+    const double y = call.y[tile.j];
+    for (int row = 0; row < 3; row++) {
+        float sum = 0.0f, sum_x = 0.0f, sum_offset = 0.0f;
+        for (int s = 0; s < n; s++) {
+            const float grad_plane = site.grad_index[row][s] * tile.depth[s];
+            const float unclamped = std::fabs(tile.plane[row][s]) < LARGEST_COORDINATE ? grad_plane : 0.0f;
+            sum += unclamped;
+            sum_x += unclamped * tile.x[s];
+            sum_offset += site.grad_index[row][s];
+            grad_z[s] -= double(grad_plane) * tile.plane[row][s] * tile.depth[s];
+        }
+        if (matrix) {
+            double *to = matrix + 4 * row;
+            to[0] += sum_x;
+            to[1] += double(sum) * y;
+            to[2] += sum_offset;
+            to[3] += sum;
+        }
+    }
+    if (call.depth && !view.masked)
+        for (int s = 0; s < n; s++) grad_z[s] -= double(site.grad_distance[s]) * tile.depth[s] * tile.depth[s];
+}
+
+// Ray directions: adds to the gradient to G, unless null, and to that to the z of each site.
+inline void accumulate_direction_gradients(const Call &call, const View &view, const Tile &tile,
+                                           const SiteGradients &site, double *direction, double *grad_z) {
+    const int n = int(tile.count);
+    const double y = call.y[tile.j];
+    float rows[3][TILE];
+    for (int s = 0; s < n; s++) {
+        float along = 0.0f;
+        for (int row = 0; row < 3; row++) along += site.grad_direction[row][s] * tile.direction[row][s];
+        for (int row = 0; row < 3; row++)
+            rows[row][s] = (site.grad_direction[row][s] - along * tile.direction[row][s]) * tile.inverse_length[s];
+    }
+    for (int row = 0; row < 3; row++) {
+        const double inner = view.direction[row][2];
+        double sum = 0.0, sum_x = 0.0, sum_z = 0.0;
+        for (int s = 0; s < n; s++) {
+            sum += rows[row][s];
+            sum_x += double(rows[row][s]) * tile.x[s];
+            sum_z += double(rows[row][s]) * plane_z(call, tile, tile.k + (tile.along_z ? s : 0));
+            grad_z[s] += rows[row][s] * inner;
+        }
+        if (direction) {
+            double *to = direction + 4 * row;
+            to[0] += view.direction_scale * sum_x;
+            to[1] += view.direction_scale * sum * y;
+            to[2] += view.direction_scale * sum_z;
+            to[3] += view.direction_scale * sum;
+        }
+    }
+}
 
 inline void load_extra_gradients(const Call &call, const Tile &tile, int s, const float *gradient,
                                  SiteGradients &site_gradients) {
@@ -135,26 +130,28 @@ inline void clear_source_gradient(const Call &call, int64_t scene, int64_t view,
                 std::memset(first + z * stride[2] + y * stride[3] + x * stride[4], 0, size_t(channels) * sizeof(float));
 }
 
-inline GeometryGradients geometry_gradients(const Call &call, int64_t scene, int64_t view, int64_t chunk) {
-    const int64_t at = (scene * call.views + view) * call.chunks + chunk;
-    return {call.matrix_gradient ? call.matrix_gradient + 12 * at : nullptr,
-            call.direction_gradient ? call.direction_gradient + 12 * at : nullptr,
-            call.z_gradient ? call.z_gradient + call.sites[2] * at : nullptr};
-}
-
-inline void store_geometry_gradients(const Plan &plan, const Tile &tile, int64_t chunk,
-                                     const SiteGradients &site_gradients) {
+// Adds the gradients to a view's matrices M and G and to z, or writes those to its pixels.
+inline void store_geometry_gradients(const Plan &plan, const Tile &tile, int64_t chunk, const SiteGradients &site) {
     const Call &call = *plan.call;
+    const View &view = view_of(plan, tile);
     if (call.kind != SAMPLE_VIEWS) {
-        const GeometryGradients sums = geometry_gradients(call, tile.scene, tile.view, chunk);
-        if (sums.matrix || sums.direction || sums.z)
-            accumulate_geometry_gradients(plan, tile, site_gradients.grad_index, site_gradients.grad_distance,
-                                          site_gradients.grad_direction, sums);
+        const int64_t at = (tile.scene * call.views + tile.view) * call.chunks + chunk;
+        double *matrix = call.matrix_gradient ? call.matrix_gradient + 12 * at : nullptr;
+        double *direction = call.direction_gradient ? call.direction_gradient + 12 * at : nullptr;
+        double *z = call.z_gradient ? call.z_gradient + call.sites[2] * at : nullptr;
+        if (!matrix && !direction && !z) return;
+        double grad_z[TILE] = {}, tile_grad_z = 0.0;
+        if (call.kind == PLANE_SWEEP_PROJECT) accumulate_volume_gradients(call, view, tile, site, matrix, grad_z);
+        else tile_grad_z = accumulate_image_gradients(call, view, tile, site, matrix);
+        if (call.direction && !view.masked)
+            accumulate_direction_gradients(call, view, tile, site, direction, grad_z);
+        if (!z) return;
+        z[tile.k] += tile_grad_z;
+        for (int s = 0; s < int(tile.count); s++) z[tile.k + (tile.along_z ? s : 0)] += grad_z[s];
     } else if (call.pixels_gradient) {
         const int64_t at = ((chunk * call.scenes + tile.scene) * call.views + tile.view) * call.sites[0] + tile.i;
         for (int64_t s = 0; s < tile.count; s++)
-            for (int axis = 0; axis < 2; axis++)
-                call.pixels_gradient[2 * (at + s) + axis] = site_gradients.grad_index[axis][s];
+            for (int axis = 0; axis < 2; axis++) call.pixels_gradient[2 * (at + s) + axis] = site.grad_index[axis][s];
     }
 }
 

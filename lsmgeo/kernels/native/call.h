@@ -35,7 +35,7 @@ struct Call {
 
     const void *gradient;
     int64_t gradient_type, gradient_stride[6];
-    int64_t chunks, accumulate;    // parts of the channels; whether the source's gradient is added to what is there
+    int64_t chunks, accumulate;    // parts of the channels; whether to add to the source's gradient
     float *source_gradient;
     int64_t source_gradient_stride[5];
     double *matrix_gradient, *direction_gradient;  // (B, V, chunks, 3, 4), or null

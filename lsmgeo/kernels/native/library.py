@@ -1,7 +1,7 @@
 """The C++ kernels: loading the library, and calls on tensors without derivatives.
 
-The library is a part of the package that a build without a compiler leaves out; `why_not` says so then. It knows
-nothing of Python or PyTorch: tensors are handed over as addresses and strides, threads are those of PyTorch's own pool.
+Without a compiler the package is built without the library; `why_not` then says so. The library does not depend on
+Python or PyTorch: tensors are passed as addresses and strides, and the threads are those of PyTorch's own pool.
 """
 
 from __future__ import annotations
@@ -20,23 +20,11 @@ from lsmgeo._dtypes import saturating_cast
 from lsmgeo._torch_compat import as_constant
 from lsmgeo.kernels.request import Options, Sites
 
-__all__ = [
-    "empty",
-    "instruction_set",
-    "plane_sweep_project",
-    "plane_sweep_project_backward",
-    "sample_views",
-    "sample_views_backward",
-    "unproject",
-    "unproject_backward",
-    "why_not",
-]
-
 UNPROJECT, SAMPLE_VIEWS, PLANE_SWEEP_PROJECT = range(3)
 TYPES = {torch.float32: 0, torch.bfloat16: 1, torch.float16: 2}
 STATISTICS = {"mean": 0, "variance": 1, "max": 2}
-HUGE = 4 << 20  # bytes from which an output is put in huge pages
-LEAST_CHUNK = 8  # channels that are worth a task of their own
+HUGE = 4 << 20  # bytes from which an output is allocated in huge pages
+LEAST_CHUNK = 8  # channels of a task
 
 _INTEGER, _NUMBER, _ADDRESS = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
@@ -76,7 +64,7 @@ class _Call(ctypes.Structure):
 
 @cache
 def _library() -> ctypes.CDLL | str:
-    """The library, or why there is none."""
+    """The library, or why it is missing."""
     if os.environ.get("LSMGEO_NATIVE") == "0":
         return "turned off by LSMGEO_NATIVE=0"
     folder = Path(__file__).parent
@@ -146,7 +134,7 @@ def empty(shape: Sequence[int], dtype: torch.dtype, order: Sequence[int] | None 
     return tensor.permute([order.index(axis) for axis in range(len(shape))])
 
 
-# Calls: each function fills in what it has, hands it over, and keeps the tensors alive until the kernel is done.
+# Calls: `_set_*` fill in a part of the arguments; tensors must stay alive until the kernel is done.
 
 
 def _run(call: _Call, backward: bool) -> None:
@@ -157,8 +145,8 @@ def _run(call: _Call, backward: bool) -> None:
         raise MemoryError("lsmgeo: no memory for the workspace of a kernel")
 
 
-def _channels_last(source: Tensor, axis: int) -> Tensor:
-    """The source with channels next to one another; a copy only where they are not."""
+def channels_last(source: Tensor, axis: int) -> Tensor:
+    """The source with adjacent channels; a copy only where they are not."""
     if source.shape[axis] < 2 or source.stride(axis) == 1:
         return source
     return source.movedim(axis, -1).contiguous().movedim(-1, axis)
@@ -187,7 +175,7 @@ def _new_call(kind: int, source: Tensor, options: Options, sites: Sequence[int])
 
 
 def _set_sites(call: _Call, sites: Sites, options: Options) -> tuple[Tensor | None, ...]:
-    """Hand over the geometry; the answer must live as long as the call."""
+    """Set the geometry; the result must live as long as the call."""
     B, V = call.scenes, call.views = sites.matrix.shape[:2]
     matrix, x, y = sites.matrix.contiguous(), sites.x.contiguous(), sites.y.contiguous()
     direction = sites.direction.expand(B, V, 3, 4).contiguous() if options.direction else None  # type: ignore[union-attr]
@@ -203,7 +191,7 @@ def _set_sites(call: _Call, sites: Sites, options: Options) -> tuple[Tensor | No
 
 
 def _set_gradient(call: _Call, gradient: Tensor, options: Options) -> None:
-    """Hand over the incoming gradient; split the channels where scenes and views alone would not feed the threads."""
+    """Set the incoming gradient; split the channels where there are fewer scenes and views than threads."""
     call.gradient, call.gradient_type = gradient.data_ptr(), TYPES[gradient.dtype]
     call.gradient_stride[:] = _value_strides(gradient, options)
     units = max(1, call.scenes * (1 if call.kind == PLANE_SWEEP_PROJECT or call.statistics else call.views))
@@ -214,14 +202,14 @@ def _set_gradient(call: _Call, gradient: Tensor, options: Options) -> None:
 
 
 def _set_source_gradient(call: _Call, source: Tensor, axis: int, into: Tensor | None) -> Tensor:
-    """Where the source's gradient goes, in float32: `into`, to be added to, or fresh memory that the kernel clears."""
+    """Set the memory of the source's gradient, float32: `into`, to add to, or new memory that the kernel clears."""
     if into is None:
         order = [other for other in range(source.dim()) if other != axis]
         gradient = empty(source.shape, torch.float32, [*order, axis])
         if 0 in call.sites[:]:  # then no task runs that would clear it
             gradient.zero_()
     elif into.shape[axis] > 1 and into.stride(axis) != 1:
-        raise ValueError("the channels of a gradient to add to must be next to one another")
+        raise ValueError("the channels of a gradient to add to must be adjacent")
     else:
         gradient = into
     strides = gradient.stride()
@@ -231,7 +219,7 @@ def _set_source_gradient(call: _Call, source: Tensor, axis: int, into: Tensor | 
 
 
 def _set_geometry_gradients(call: _Call, needs: Sequence[bool]) -> list[Tensor | None]:
-    """Room for the gradients to matrix, direction and z, a part for each chunk of channels."""
+    """Set the memory of the gradients to matrix, direction and z, a part for each chunk of channels."""
     B, V, D = call.scenes, call.views, call.sites[2]
     shapes = ((3, 4), (3, 4), (D,))
     parts = [
@@ -244,13 +232,9 @@ def _set_geometry_gradients(call: _Call, needs: Sequence[bool]) -> list[Tensor |
     return parts
 
 
-def _over_chunks(parts: Sequence[Tensor | None]) -> list[Tensor | None]:
-    return [None if part is None else part.sum(2) for part in parts]
-
-
 def _lattice_call(kind: int, source: Tensor, sites: Sites, options: Options) -> tuple[_Call, tuple[Tensor | None, ...]]:
     """A call on the sites of a lattice, and what must live as long as it."""
-    source = _channels_last(source, _channel_axis(kind))
+    source = channels_last(source, _channel_axis(kind))
     call = _new_call(kind, source, options, (sites.x.shape[0], sites.y.shape[0], sites.z.shape[-1]))
     return call, (source, *_set_sites(call, sites, options))
 
@@ -276,13 +260,13 @@ def _lattice_backward(
     del alive
     if to_source is not None and into is None:
         to_source = saturating_cast(to_source, source.dtype)
-    return to_source, *_over_chunks(parts)  # type: ignore[return-value]
+    return to_source, *(None if part is None else part.sum(2) for part in parts)  # type: ignore[return-value]
 
 
 def _forward(
     call: _Call, alive: Sequence[Tensor | None], dtype: torch.dtype, options: Options, out: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Run a call forward; `alive` must live as long as it. `out` is memory of the answer's shape to write to."""
+    """Run a call forward; `alive` must live as long as it. `out` is memory of the values' shape to write to."""
     counts, reduced = call.sites[::-1], bool(options.reduce)
     channels = (call.channels + call.depth + 3 * call.direction + call.extra) * max(1, len(options.reduce))
     views = () if reduced else (call.views,)
@@ -304,7 +288,7 @@ def _value_strides(values: Tensor, options: Options) -> tuple[int, ...]:
 
 
 def unproject(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """As `reference.unproject`; `out` is memory of the answer's shape to write to."""
+    """As `reference.unproject`; `out` is memory of the values' shape to write to."""
     return _forward(*_lattice_call(UNPROJECT, source, sites, options), source.dtype, options, out)
 
 
@@ -316,19 +300,10 @@ def unproject_backward(
     needs: Sequence[bool],
     into: Tensor | None = None,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """Vector-Jacobian product of `unproject` to source, matrix, direction and z.
+    """Vector-Jacobian product of `unproject` to source, matrix, direction and z, None where not in `needs`.
 
-    Args:
-        gradient: of the values, any strides.
-        source: as for `unproject`.
-        sites: as for `unproject`.
-        options: as for `unproject`.
-        needs: which of the four are asked for.
-        into: float32 memory of the source's shape, channels next to one another, to add its gradient to.
-
-    Returns:
-        Gradients, None where not asked for: of source in its dtype, of matrices (B, V, 3, 4) and of z (B, V, D) in
-        float64.
+    The gradient may have any strides. That to the source has its dtype; those to matrices (B, V, 3, 4) and z (B, V, D)
+    are float64. `into` is float32 memory of the source's shape, channels adjacent, to add its gradient to.
     """
     return _lattice_backward(UNPROJECT, gradient, source, sites, options, needs, into)
 
@@ -337,7 +312,7 @@ def sample_views(
     source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options
 ) -> tuple[Tensor, Tensor]:
     """Sample images (B, V, C, h, w) at pixels (B, V, N, 2) where `front` (B, V, N), append `extra` (B, V, E, N)."""
-    source = _channels_last(source, 2)
+    source = channels_last(source, 2)
     values, visible = _forward(*_pixels_call(source, pixels, front, extra, options), source.dtype, options)
     return values[..., 0, 0, :], visible[:, :, 0, 0]
 
@@ -364,7 +339,7 @@ def sample_views_backward(
     needs: Sequence[bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
     """Vector-Jacobian product of `sample_views` to source, pixels and extra, each in its dtype."""
-    original, source = source, _channels_last(source, 2)
+    original, source = source, channels_last(source, 2)
     call, alive = _pixels_call(source, pixels, front, extra, options)
     _set_gradient(call, gradient[..., None, None, :], options)
     to_source = _set_source_gradient(call, source, 2, None) if needs[0] else None
@@ -386,7 +361,7 @@ def sample_views_backward(
 def plane_sweep_project(
     source: Tensor, sites: Sites, options: Options, out: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """As `reference.plane_sweep_project`; `out` is memory of the answer's shape, any strides, to write to."""
+    """As `reference.plane_sweep_project`; `out` is memory of the values' shape, any strides, to write to."""
     return _forward(*_lattice_call(PLANE_SWEEP_PROJECT, source, sites, options), source.dtype, options, out)
 
 

@@ -131,14 +131,7 @@ inline void interpolation_weights(const Call &call, Tile &tile) {
             tile.visible[s] &= int32_t(index >= -0.5f) & int32_t(index < size - 0.5f);
             tile.in_range[s] &= int32_t(cell >= least) & int32_t(cell < size);
             tile.interior[s] &= int32_t(cell >= 0.0f) & int32_t(cell < size - 1.0f);
-        }
-        if (border) {
-            for (int s = 0; s < n; s++) {
-                const float index = tile.index[axis][s];
-                tile.slope[axis][s] = index > 0.0f && index < size - 1.0f ? 1.0f : 0.0f;
-            }
-        } else {
-            for (int s = 0; s < n; s++) tile.slope[axis][s] = 1.0f;
+            tile.slope[axis][s] = !border || (index > 0.0f && index < size - 1.0f) ? 1.0f : 0.0f;
         }
     }
     if (nearest) return;

@@ -1,6 +1,6 @@
-"""The small side of the Triton backend: tables of what places the sites, and what their sums mean for the matrices.
+"""Tables of the sites for the Triton kernels, and from the kernels' sums to the gradients to matrices and depths.
 
-Everything here is of the size of the matrices and the axes, in PyTorch and in float64 until the kernels read it.
+All of it has the size of the matrices and axes, and is float64 until the kernels read it.
 """
 
 from __future__ import annotations
@@ -13,13 +13,11 @@ from torch import Tensor
 from lsmgeo.kernels.lattice_geometry import lattice_extent, per_view, power_of_two_above, scale_below_overflow
 from lsmgeo.kernels.request import Options, Sites
 
-__all__ = ["Tables", "lattice_gradients", "tables"]
-
 
 class Tables(NamedTuple):
-    """The sites of a lattice for the kernels, and what their gradients go back through, float64."""
+    """The sites of a lattice for the kernels, and what the gradients need, float64."""
 
-    views: Tensor  # (B, V, 28), see `forward.FIELDS`
+    views: Tensor  # (B, V, 28), see `types.FIELDS`
     x: Tensor  # these four float32
     y: Tensor
     z: Tensor  # (B, V, D)
@@ -28,12 +26,12 @@ class Tables(NamedTuple):
     matrix: Tensor  # as in `views`
     scale: Tensor  # (B, V), of the matrix
     direction: Tensor | None
-    shrink: Tensor | None  # (B, V), of the direction's matrix
+    direction_scale: Tensor | None  # (B, V), of the direction's matrix
     exact: Tensor  # z, or the depth of volumes, float64
 
 
 def tables(sites: Sites, options: Options, volume: bool) -> Tables:
-    """Views left out have matrices of zeros: whatever stands in theirs reaches nobody."""
+    """The tables of a call. Masked views have matrices of zeros, so that theirs are not read."""
     mask = sites.view_mask
     z = per_view(sites.z, sites.matrix)
     matrix, direction = sites.matrix, sites.direction if options.direction else None
@@ -43,7 +41,7 @@ def tables(sites: Sites, options: Options, volume: bool) -> Tables:
         direction = None if direction is None else torch.where(mask[..., None, None], direction, 0.0)
     one = matrix.new_ones(matrix.shape[:2])
     kept = one if mask is None else mask.to(one.dtype)
-    scale, shrink = one, None
+    scale, direction_scale = one, None
     if not volume:  # homogeneous: a factor moves no pixel
         scale = scale_below_overflow(lattice_extent(matrix, sites._replace(z=z)))
         matrix = matrix * scale[..., None, None]
@@ -51,8 +49,8 @@ def tables(sites: Sites, options: Options, volume: bool) -> Tables:
     if direction is None:
         fields.append(one[..., None].expand(-1, -1, 14))
     else:
-        shrink = 1.0 / power_of_two_above(direction.abs().amax((-1, -2)))
-        direction = direction * shrink[..., None, None]
+        direction_scale = 1.0 / power_of_two_above(direction.abs().amax((-1, -2)))
+        direction = direction * direction_scale[..., None, None]
         terms = direction.abs().amax(-2)
         constant = terms[..., 0] * sites.x.abs().amax(0) + terms[..., 1] * sites.y.abs().amax(0) + terms[..., 3]
         fields += [direction.flatten(2), constant[..., None], terms[..., 2, None]]
@@ -67,7 +65,7 @@ def tables(sites: Sites, options: Options, volume: bool) -> Tables:
         matrix,
         scale,
         direction,
-        shrink,
+        direction_scale,
         z if depth is None else depth,
     )
 
@@ -92,7 +90,7 @@ def lattice_gradients(
     )
     if tables.depth is not None:
         depth = tables.exact
-        matrix = _outer_sums(rows, depth, torch.ones_like(depth))
+        matrix = _matrix_sums(rows, depth, torch.ones_like(depth))
         plane = torch.cat((tables.matrix[..., :2], tables.matrix[..., 3:]), -1)[:, :, None]
         along = (rows * plane).sum((-1, -2))
         if options.depth and extra is not None:
@@ -105,17 +103,17 @@ def lattice_gradients(
             rows[..., 2, :] += extra[..., :3]
             if tables.projective:
                 through = -extra[..., 3] / z
-        matrix = _outer_sums(rows, torch.ones_like(z), z) * tables.scale[..., None, None]
+        matrix = _matrix_sums(rows, torch.ones_like(z), z) * tables.scale[..., None, None]
         z_gradient = (rows[..., 2] * tables.matrix[:, :, None, :, 2]).sum(-1) + through
     direction = None
-    if tables.direction is not None and tables.shrink is not None and extra is not None:
-        turned = extra[..., 4:].unflatten(-1, (3, 3))
-        direction = _outer_sums(turned, torch.ones_like(z), z) * tables.shrink[..., None, None]
-        z_gradient = z_gradient + (turned[..., 2] * tables.direction[:, :, None, :, 2]).sum(-1)
+    if tables.direction is not None and tables.direction_scale is not None and extra is not None:
+        direction_rows = extra[..., 4:].unflatten(-1, (3, 3))
+        direction = _matrix_sums(direction_rows, torch.ones_like(z), z) * tables.direction_scale[..., None, None]
+        z_gradient = z_gradient + (direction_rows[..., 2] * tables.direction[:, :, None, :, 2]).sum(-1)
     return matrix, direction, z_gradient
 
 
-def _outer_sums(rows: Tensor, plane: Tensor, line: Tensor) -> Tensor:
+def _matrix_sums(rows: Tensor, plane: Tensor, line: Tensor) -> Tensor:
     """Sums over the planes of (B, V, D, 3, 3) with factors (B, V, D) of the terms in x, y and 1, and in z."""
     x, y, one = (rows * plane[..., None, None]).sum(2).unbind(-1)
     return torch.stack((x, y, (rows[..., 2] * line[..., None]).sum(2), one), -1)

@@ -14,18 +14,6 @@ from lsmgeo._dtypes import saturation_limit
 from lsmgeo.kernels.request import Options
 from lsmgeo.kernels.triton.launch_tables import Tables
 
-__all__ = [
-    "Accumulator",
-    "Call",
-    "accumulator",
-    "channels_last",
-    "empty_channels_last",
-    "launch",
-    "plan",
-    "room_for_sums",
-    "strided",
-]
-
 TILE = 2048  # elements: 16 for each thread of four warps
 SITES = (16, 256)  # of a tile
 CHANNELS = (4, 64)
@@ -46,12 +34,12 @@ def _types() -> ModuleType:
 
 
 class Call(NamedTuple):
-    """What both kernels are launched with."""
+    """The arguments of both kernels."""
 
     lattice: Any
     points: Any
     sizes: Any
-    how: Any
+    config: Any
     near: float
     programs: int
     views: int  # B V
@@ -67,23 +55,23 @@ def plan(
     volume: bool = False,
     needs: tuple[bool, bool] = (False, False),
 ) -> Call:
-    """Plan a launch.
+    """Choose the tiles of a launch.
 
     Args:
         source: (B, V, C, d, h, w).
         target: values or their gradient: (B, V, C', D, H, W), or (B, 1, C'', D, H, W).
         options: of the call.
         extras: number of geometric channels.
-        lattice: tables of the sites, or
-        points: pixels, front and given channels.
-        volume: whether the sites are those of frustums.
-        needs: whether the source's gradient is needed, and that of the geometry.
+        lattice: tables of the sites, None for given pixels.
+        points: pixels, front and geometric channels of given pixels.
+        volume: whether the source is a volume.
+        needs: whether the gradients to the source and to the geometry are needed.
     """
     types = _types()
     views, channels = source.shape[1:3]
     planes, height, width = target.shape[3:]
-    columns = _within(_power_of_two(channels), CHANNELS)
-    block = _within(TILE // columns, SITES)
+    columns = _clamped(_power_of_two(channels), CHANNELS)
+    block = _clamped(TILE // columns, SITES)
     # Small planes share a program. Where the third axis is the fastest in memory, a store along it is one transaction.
     run = max(1, block // _power_of_two(height * width))
     if 0 < target.stride(3) < max(target.stride(4), target.stride(5)):
@@ -94,7 +82,7 @@ def plan(
     blocks = -(-height * width // (block // run))
     order = {name: place for place, name in enumerate(options.reduce)}
     kind = types.PIXELS if lattice is None else types.VOLUME if volume else types.IMAGES
-    how = types.How(
+    config = types.Config(
         kind=kind.value,
         nearest=options.mode == "nearest",
         border=options.padding_mode == "border",
@@ -120,7 +108,7 @@ def plan(
         types.Lattice(*(None,) * 5) if lattice is None else types.Lattice(*lattice[:5]),
         types.Points(*points),
         types.Sizes(views, channels, planes, height, width, *cells, tiles, blocks, slabs),
-        how,
+        config,
         min(float(options.near), torch.finfo(torch.float32).max),
         tiles * blocks * slabs * source.shape[0] * (1 if options.reduce else views),
         source.shape[0] * views,
@@ -128,10 +116,10 @@ def plan(
 
 
 def launch(name: str, call: Call, *arrays: Any) -> None:
-    """Run a kernel on the arrays' device, unless it has nothing to do."""
+    """Run a kernel on the arrays' device; does nothing where there are no sites."""
     if call.programs:
         with torch.cuda.device_of(arrays[0].pointer):
-            warps = 8 if call.how.reduce else 4  # statistics need more registers
+            warps = 8 if call.config.reduce else 4  # statistics need more registers
             # Fused multiply-adds are Triton's default, which is to change.
             kernels()[name][(call.programs,)](
                 *arrays,
@@ -139,7 +127,7 @@ def launch(name: str, call: Call, *arrays: Any) -> None:
                 call.points,
                 call.sizes,
                 call.near,
-                call.how,
+                call.config,
                 num_warps=warps,
                 enable_fp_fusion=True,
             )
@@ -155,14 +143,14 @@ def _power_of_two(count: int) -> int:
     return 1 << max(0, count - 1).bit_length()
 
 
-def _within(value: int, bounds: tuple[int, int]) -> int:
+def _clamped(value: int, bounds: tuple[int, int]) -> int:
     return min(max(value, bounds[0]), bounds[1])
 
 
 def channels_last(source: Tensor, reads: int) -> Tensor:
-    """The (B, V, C, d, h, w) source with its channels side by side, which is how the kernels read them.
+    """The (B, V, C, d, h, w) source with adjacent channels, as the kernels read them.
 
-    A copy, of what is not repeated by strides of 0, unless few of its cells are read.
+    A copy, axes of stride 0 only once, unless few of its cells are read.
     """
     cells = math.prod(source.shape[3:])
     if source.shape[2] == 1 or source.stride(2) == 1 or reads < cells or source.numel() == 0:
@@ -186,14 +174,14 @@ class Accumulator(NamedTuple):
     scale: Tensor | None = None  # (1,) float32, of fixed-point numbers
 
     def total(self) -> Tensor:
-        """What was added up, float32."""
+        """The sum, float32."""
         return self.array if self.scale is None else (self.array.double() / self.scale.double()).float()
 
 
 def accumulator(
     gradient: Tensor, source: Tensor, options: Options, sites: int, shared: bool, given: Tensor | None = None
 ) -> Accumulator:
-    """What to add to: float32, or, where results must not depend on the order of the sums, fixed-point numbers.
+    """Memory to add to: float32, or fixed-point numbers where results must not depend on the order of the sums.
 
     Args:
         gradient: the incoming gradient.
@@ -201,7 +189,7 @@ def accumulator(
         options: of the call.
         sites: how many sites may add to one cell.
         shared: whether the views add to the same cells.
-        given: float32 numbers to add to, (B, 1, C, d, h, w); otherwise to zeros.
+        given: float32 memory to add to, (B, 1, C, d, h, w); zeros if None.
     """
     fixed = torch.are_deterministic_algorithms_enabled() and gradient.numel() > 0
     if given is not None and not fixed:
@@ -217,15 +205,15 @@ def accumulator(
         bound = bound * (1.0 + 8.0 * largest)
     exponent = 62.0 - math.ceil(math.log2(max(1, sites))) - torch.log2(bound).ceil()
     scale = torch.where(bound.isfinite(), torch.exp2(exponent.clamp(-126.0, 126.0)), torch.nan)
-    return Accumulator(array, scale.float().reshape(1))  # no number, if the gradient is none
+    return Accumulator(array, scale.float().reshape(1))  # NaN if the gradient is not finite
 
 
-def room_for_sums(call: Call, options: Options, needed: bool, like: Tensor) -> tuple[Tensor | None, Tensor | None]:
-    """Room for the sums of `lattice_gradients`, of those that the kernel writes."""
+def allocate_sums(call: Call, options: Options, needed: bool, like: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    """Memory for the sums of `lattice_gradients` that the kernel writes."""
     types = _types()
     n, index, extra = call.sizes, None, None
     if needed and options.mode != "nearest":
         index = like.new_empty((call.views, n.planes, n.blocks, n.tiles, types.INDEX_SUMS.value), dtype=torch.float32)
-    if needed and call.how.extras:
+    if needed and call.config.extras:
         extra = like.new_empty((call.views, n.planes, n.blocks, types.EXTRA_SUMS.value), dtype=torch.float32)
     return index, extra

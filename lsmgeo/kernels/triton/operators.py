@@ -1,7 +1,6 @@
-"""The Triton backend: the operators, and how the kernels are launched for them.
+"""The Triton kernels: calls on tensors without derivatives. Triton is imported at the first call.
 
-Tensors in, tensors out, no autograd. Everything of the size of the sites is done in one launch. Triton is imported at
-the first call.
+Everything of the size of the sites is computed in one launch.
 """
 
 from __future__ import annotations
@@ -22,27 +21,17 @@ from lsmgeo.kernels.triton.launcher import (
     Accumulator,
     Call,
     accumulator,
+    allocate_sums,
     channels_last,
     empty_channels_last,
     launch,
     plan,
-    room_for_sums,
     strided,
 )
 
-__all__ = [
-    "plane_sweep_project",
-    "plane_sweep_project_backward",
-    "sample_views",
-    "sample_views_backward",
-    "unproject",
-    "unproject_backward",
-    "why_not",
-]
-
 
 def why_not(operator: str, source: Tensor, options: Options) -> str | None:
-    """Why these kernels cannot run a call; None if they can."""
+    """Why the Triton kernels cannot run a call, or None."""
     if source.dtype == torch.float64:
         return "float64 stays on the reference path"
     if not _is_installed():
@@ -61,16 +50,12 @@ def _is_interpreted() -> bool:
     return os.environ.get("TRITON_INTERPRET", "").lower() in ("1", "true", "on", "yes", "y")
 
 
-def _extras(options: Options) -> int:
-    return int(options.depth) + 3 * bool(options.direction)
-
-
-def _joined(values: Tensor, options: Options) -> Tensor:
+def _without_views(values: Tensor, options: Options) -> Tensor:
     """(B, 1, C'', ...) -> (B, C'', ...) where views are reduced."""
     return values[:, 0] if options.reduce else values
 
 
-def _split(gradient: Tensor, options: Options) -> Tensor:
+def _with_views(gradient: Tensor, options: Options) -> Tensor:
     return gradient[:, None] if options.reduce else gradient
 
 
@@ -83,45 +68,31 @@ def _forward(
         return visible.view(torch.bool)
     lattice = None if sites is None else tables(sites, options, planned.get("volume", False))
     call = plan(source, out, options, extras, lattice, **planned)
-    source = channels_last(source, math.prod(out.shape[3:]) * call.how.corners)
+    source = channels_last(source, math.prod(out.shape[3:]) * call.config.corners)
     launch("resample", call, strided(out), visible, strided(source))
     return visible.view(torch.bool)
 
 
 @torch.no_grad()
 def unproject(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
-    """As `reference.unproject`: images (B, V, C, h, w) at the sites of a lattice.
-
-    Returns:
-        (B, V, C', D, H, W), or (B, C'', D, H, W) where options.reduce is set, channels last in memory, and visibility
-        (B, V, D, H, W).
-    """
+    """As `reference.unproject`; values are channels last in memory."""
     B, V, C = source.shape[:3]
-    channels = (C + _extras(options)) * max(1, len(options.reduce))
-    shape = (sites.z.shape[-1], len(sites.y), len(sites.x))
-    out = empty_channels_last(B, 1 if options.reduce else V, channels, *shape, like=source)
-    visible = _forward(source.unsqueeze(3), out, options, _extras(options), sites)
-    return _joined(out, options), visible
+    channels = (C + options.appended()) * max(1, len(options.reduce))
+    out = empty_channels_last(B, 1 if options.reduce else V, channels, *sites.counts(), like=source)
+    visible = _forward(source.unsqueeze(3), out, options, options.appended(), sites)
+    return _without_views(out, options), visible
 
 
 @torch.no_grad()
 def unproject_backward(
     gradient: Tensor, source: Tensor, sites: Sites, options: Options, needs: tuple[bool, bool, bool, bool]
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """The vector-Jacobian product of `unproject`.
+    """Vector-Jacobian product of `unproject` to source, matrix, direction and z, None where not in `needs`.
 
-    Args:
-        gradient: of its values, any strides.
-        source: as given to it.
-        sites: as given to it.
-        options: as given to it.
-        needs: which of the gradients below are needed.
-
-    Returns:
-        Gradients to the source, in its dtype; to M and G (B, V, 3, 4) and to z (B, V, D), float64. None where not
-        needed.
+    The gradient may have any strides. That to the source has its dtype; those to matrices (B, V, 3, 4) and z (B, V, D)
+    are float64.
     """
-    found = _lattice_backward(_split(gradient, options), source.unsqueeze(3), sites, options, needs, False)
+    found = _lattice_backward(_with_views(gradient, options), source.unsqueeze(3), sites, options, needs, False)
     return None if found[0] is None else saturating_cast(found[0].squeeze(3), source.dtype), *found[1:]
 
 
@@ -140,8 +111,8 @@ def _lattice_backward(
     into = accumulator(gradient, source, options, count, volume, given) if needs[0] else None
     if count:
         known = tables(sites, options, volume)
-        call = plan(source, gradient, options, _extras(options), known, volume=volume, needs=wanted)
-        index_sums, extra_sums = room_for_sums(call, options, wanted[1], source)
+        call = plan(source, gradient, options, options.appended(), known, volume=volume, needs=wanted)
+        index_sums, extra_sums = allocate_sums(call, options, wanted[1], source)
         _launch_backward(call, gradient, source, into, index_sums, extra_sums)
         found = lattice_gradients(known, options, index_sums, extra_sums) if wanted[1] else (None,) * 3
     else:
@@ -168,8 +139,8 @@ def _launch_backward(
 ) -> None:
     if into is None and index_sums is None and extra_sums is None:
         return  # the nearest cell does not depend on the geometry
-    if index_sums is not None or call.how.reduce:
-        source = channels_last(source, math.prod(gradient.shape[3:]) * call.how.corners)
+    if index_sums is not None or call.config.reduce:
+        source = channels_last(source, math.prod(gradient.shape[3:]) * call.config.corners)
     array, scale = (source, None) if into is None else (into.array.expand(source.shape), into.scale)
     arrays = strided(gradient), strided(source), strided(array), scale, index_sums, extra_sums
     launch("resample_backward", call, *arrays)
@@ -179,24 +150,13 @@ def _launch_backward(
 def sample_views(
     source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options
 ) -> tuple[Tensor, Tensor]:
-    """Sample images (B, V, C, h, w) at given pixels; the options' depth and direction have been seen to.
-
-    Args:
-        source: the images.
-        pixels: (B, V, N, 2).
-        front: (B, V, N) bool, where to sample.
-        extra: (B, V, E, N), geometric channels to append, or None.
-        options: of the call.
-
-    Returns:
-        (B, V, C + E, N), or (B, C'', N) where options.reduce is set, channels last in memory, and visibility (B, V, N).
-    """
+    """As `reference.sample_pixels`; values are channels last in memory."""
     (B, V, C), N = source.shape[:3], pixels.shape[2]
     extras = 0 if extra is None else extra.shape[2]
     channels = (C + extras) * max(1, len(options.reduce))
     out = empty_channels_last(B, 1 if options.reduce else V, channels, 1, 1, N, like=source)
     visible = _forward(source.unsqueeze(3), out, options, extras, points=_points(pixels, front, extra))
-    return _joined(out[:, :, :, 0, 0], options), visible[:, :, 0, 0]
+    return _without_views(out[:, :, :, 0, 0], options), visible[:, :, 0, 0]
 
 
 def _points(pixels: Tensor, front: Tensor, extra: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -217,20 +177,10 @@ def sample_views_backward(
     options: Options,
     needs: tuple[bool, bool, bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    """The vector-Jacobian product of `sample_views`: gradients to source, pixels and extra, in their dtypes.
-
-    Args:
-        gradient: of its values, any strides.
-        source: as given to it.
-        pixels: as given to it.
-        front: as given to it.
-        extra: as given to it.
-        options: as given to it.
-        needs: which gradients are needed; the others are None.
-    """
+    """Vector-Jacobian product of `sample_views` to source, pixels and extra, in their dtypes, None where not needed."""
     (B, V), N = source.shape[:2], pixels.shape[2]
     extras = 0 if extra is None else extra.shape[2]
-    target, maps = _split(gradient, options)[:, :, :, None, None], source.unsqueeze(3)
+    target, maps = _with_views(gradient, options)[:, :, :, None, None], source.unsqueeze(3)
     points = _points(pixels, front, extra)
     call = plan(maps, target, options, extras, points=points, needs=(needs[0], any(needs[1:])))
     into = accumulator(target, maps, options, N, False) if needs[0] else None
@@ -252,28 +202,21 @@ def sample_views_backward(
 def plane_sweep_project(
     source: Tensor, sites: Sites, options: Options, out: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """As `reference.plane_sweep_project`: volumes (B, C, D, H, W) at the sites of the views' frustums.
+    """As `reference.plane_sweep_project`; `out` is memory of the maps' shape, any strides, to write to.
 
-    Args:
-        source: the volumes.
-        sites: the frustums, P planes.
-        options: of the call; where `stacked`, memory is [B][V][h][w][C'][P], else [B][V][P][h][w][C'].
-        out: where to write the maps, any strides, or None.
-
-    Returns:
-        Maps (B, V, C', P, h, w) and visibility (B, V, P, h, w).
+    Otherwise memory is [B][V][h][w][C'][P] with `options.flatten`, else [B][V][P][h][w][C'].
     """
     (B, C), V = source.shape[:2], sites.matrix.shape[1]
-    channels, (P, h, w) = C + _extras(options), (sites.z.shape[-1], len(sites.y), len(sites.x))
+    channels, (P, h, w) = C + options.appended(), sites.counts()
     if out is None and options.flatten:
         out = source.new_empty((B, V, h, w, channels, P)).permute(0, 1, 4, 5, 2, 3)
     elif out is None:
         out = empty_channels_last(B, V, channels, P, h, w, like=source)
-    views = _seen_by(source, V)
-    return out, _forward(views, out, options, _extras(options), sites, volume=True)
+    views = _per_view(source, V)
+    return out, _forward(views, out, options, options.appended(), sites, volume=True)
 
 
-def _seen_by(source: Tensor, V: int) -> Tensor:
+def _per_view(source: Tensor, V: int) -> Tensor:
     """(B, C, D, H, W) -> (B, V, C, D, H, W)."""
     return source[:, None].expand(source.shape[0], V, *source.shape[1:])
 
@@ -287,17 +230,11 @@ def plane_sweep_project_backward(
     needs: tuple[bool, bool, bool, bool],
     into: Tensor | None = None,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """The vector-Jacobian product of `plane_sweep_project`, as `unproject_backward`.
+    """Vector-Jacobian product of `plane_sweep_project`, as `unproject_backward`.
 
-    Args:
-        gradient: of its maps, any strides.
-        source: as given to it.
-        sites: as given to it.
-        options: as given to it.
-        needs: which gradients are needed.
-        into: float32, of the source's shape: the source's gradient is added to it, and it is returned.
+    `into` is float32 memory of the source's shape: the source's gradient is added to it, and it is returned.
     """
-    views = _seen_by(source, sites.matrix.shape[1])
+    views = _per_view(source, sites.matrix.shape[1])
     given = None if into is None else into[:, None]
     total, matrix, direction, z = _lattice_backward(gradient, views, sites, options, needs, True, given)
     if total is None:

@@ -1,4 +1,4 @@
-"""What the Triton kernels are told, and what their parts tell each other: constants and tuples. Imports Triton."""
+"""Arguments of the Triton kernels and what their functions exchange: constants and tuples. Imports Triton."""
 
 # mypy: disallow-untyped-decorators=False
 
@@ -8,41 +8,12 @@ from typing import Any, NamedTuple
 
 import triton.language as tl
 
-__all__ = [
-    "DIRECTION_FIELDS",
-    "EXTRAS",
-    "EXTRA_SUMS",
-    "FEATURES",
-    "FIELDS",
-    "FOUR_EPS",
-    "IMAGES",
-    "INDEX_SUMS",
-    "KEPT",
-    "LARGEST",
-    "LARGEST_COORDINATE",
-    "LARGEST_DEVIATION",
-    "OUTSIDE",
-    "PIXELS",
-    "SMALLEST_DEPTH",
-    "TERMS",
-    "UNIT",
-    "VOLUME",
-    "Cell",
-    "How",
-    "Lattice",
-    "Place",
-    "Points",
-    "Site",
-    "Sizes",
-    "Strided",
-]
-
-# What a lane is: a site of a lattice that looks into images, or into volumes, or a given pixel of images.
+# A lane is a site of a lattice that samples images or volumes, or a given pixel of images.
 IMAGES = tl.constexpr(0)
 VOLUME = tl.constexpr(1)
 PIXELS = tl.constexpr(2)
 
-# The tile of features, and that of geometric channels.
+# The tiles of features and of geometric channels.
 FEATURES = tl.constexpr(0)
 EXTRAS = tl.constexpr(1)
 
@@ -54,16 +25,16 @@ FOUR_EPS = tl.constexpr(2.0**-21)
 LARGEST = tl.constexpr((2.0 - 2.0**-23) * 2.0**127)
 LARGEST_DEVIATION = tl.constexpr(((2.0 - 2.0**-23) * 2.0**127) ** 0.5)
 
-# A view's numbers in `Lattice.views`: M by rows, the z of a site at depth 1 (or at s = 1), 1 if the view is kept; where
-# directions are asked for also G by rows, and the bound on the terms of its sums: a constant, and a factor of |z|.
+# A view's numbers in `Lattice.views`: M by rows, the z of a site at depth 1 (or at s = 1), 0 if the view is
+# masked; with directions also G by rows, and the bound on the terms of its sums: a constant, and a factor of |z|.
 FIELDS = tl.constexpr(28)
 UNIT = tl.constexpr(12)
-KEPT = tl.constexpr(13)
+UNMASKED = tl.constexpr(13)
 DIRECTION_FIELDS = tl.constexpr(14)
 TERMS = tl.constexpr(26)
 
-# Sums over the sites of a plane that a program writes: for each of three rows g x, g y and g. Those of geometric
-# channels start with the depth's row and what goes through s.
+# Sums over the sites of a plane that a program writes: for each of three rows g x, g y and g, g a gradient. Those of
+# geometric channels start with the row of the depth and its gradient through s.
 INDEX_SUMS = tl.constexpr(9)
 EXTRA_SUMS = tl.constexpr(13)
 
@@ -81,7 +52,7 @@ class Strided(NamedTuple):
 
 
 class Lattice(NamedTuple):
-    """What places the sites of a lattice: float32 tables."""
+    """The sites of a lattice: float32 tables."""
 
     views: Any  # (B V, FIELDS)
     x: Any  # (W,)
@@ -91,7 +62,7 @@ class Lattice(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Sites that come with their pixels: contiguous."""
+    """Given pixels: contiguous arrays."""
 
     pixels: Any  # (B V, N, 2) float32
     front: Any  # (B V, N) uint8
@@ -114,8 +85,8 @@ class Sizes(NamedTuple):
     slabs: Any  # of planes
 
 
-class How(NamedTuple):
-    """Everything a kernel is compiled for."""
+class Config(NamedTuple):
+    """The compile-time constants of a kernel."""
 
     kind: int
     nearest: bool
@@ -125,15 +96,15 @@ class How(NamedTuple):
     direction: bool
     extras: int  # geometric channels
     reduce: bool
-    mean: int  # place of its block of channels; -1 if not asked for
+    mean: int  # index of its block of channels; -1 if not requested
     variance: int
     maximum: int
-    largest: float  # beyond it the output saturates, see `lsmgeo._dtypes.saturation_limit`
+    largest: float  # above it the output saturates, see `lsmgeo._dtypes.saturation_limit`
     sites: int  # of a tile
-    planes: int  # of them that follow each other along the third axis: 1 unless that is the output's fastest
+    planes: int  # of them along the third axis: 1 unless that is the fastest in the output
     channels: int  # of the features' tile
     width: int  # of the tile of geometric channels
-    corners: int  # cells a sample is made of
+    corners: int  # cells that a sample reads
     needs_source: bool = False
     needs_geometry: bool = False
 
@@ -154,8 +125,8 @@ class Site(NamedTuple):
     y: Any
 
 
-class Place(NamedTuple):
-    """Where a view sees the sites, (sites,) each."""
+class Projection(NamedTuple):
+    """The sites in a view, (sites,) each."""
 
     x: Any  # index into the source
     y: Any
@@ -167,14 +138,14 @@ class Place(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """The lower cell, the way to the upper one, and the index's derivative: 0 where it is clamped."""
+    """The lower cell, the fraction towards the upper one, and the index's derivative: 0 where it is clamped."""
 
     x: Any
     y: Any
     z: Any
-    along_x: Any
-    along_y: Any
-    along_z: Any
+    fraction_x: Any
+    fraction_y: Any
+    fraction_z: Any
     slope_x: Any
     slope_y: Any
     slope_z: Any

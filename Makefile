@@ -42,7 +42,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 # What the installation is made from.
-SOURCES := setup.cfg setup.py pyproject.toml $(wildcard lsmgeo/kernels/native/*)
+SOURCES := setup.cfg setup.py pyproject.toml $(wildcard lsmgeo/kernels/native/*.h lsmgeo/kernels/native/*.cpp)
 
 $(VENV)/.core: $(SOURCES) | $(BIN)/python
 	@echo 'installing lsmgeo into $(VENV) (once; PyTorch is large)'

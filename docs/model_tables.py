@@ -65,11 +65,11 @@ def preset_rows() -> list[list[str]]:
 def config_rows(group: str) -> list[list[str]]:
     """Every key of a group of the training configuration, with its default and the docstring of its class."""
     form = GROUPS[group]
-    told = attributes_of(form)
+    descriptions = attributes_of(form)
     rows = [["key", "default", "what it is"]]
     for item in fields(form):
         default = item.default if item.default is not MISSING else item.default_factory()  # type: ignore[misc]
-        rows.append([f"``{group}.{item.name}``", f"``{default!r}``", as_rst(told[item.name])])
+        rows.append([f"``{group}.{item.name}``", f"``{default!r}``", as_rst(descriptions[item.name])])
     return rows
 
 

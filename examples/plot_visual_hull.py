@@ -35,7 +35,8 @@ solid, filled = (scenes.voxels([scene], grid)[0] for scene in (cup, full))
 
 # %%
 # Carving by the first few views, by strict intersection: a voxel stays if it is in all silhouettes, that is, if the
-# least of its signed distances to the silhouettes' outlines is above 0. A field of distances gives a smooth surface.
+# least of its signed distances to the outlines of the silhouettes is above 0. A field of distances gives a smooth
+# surface.
 
 distances = torch.stack([signed_distance(mask) for mask in masks])
 numbers = (1, 2, 3, 4, 6, 8, 12, 24)

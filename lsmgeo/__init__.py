@@ -28,7 +28,7 @@ __all__ = [
     "rays",
 ]
 
-# Where the names of `__all__` that are no modules live.
+# The modules of the names of `__all__` that are not modules.
 _HOMES = {
     "CameraTensors": "cameras",
     "FrustumGrid": "grids",

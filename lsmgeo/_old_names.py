@@ -15,10 +15,15 @@ def moved_to(place: str, old: str) -> Callable[[str], Any]:
 
     def find(name: str) -> Any:
         module = import_module(place)
-        if name.startswith("__") or not hasattr(module, name):
+        if name == "__all__":
+            return module.__all__
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of a name that has changed too
+            value = None if name.startswith("__") else getattr(module, name, None)
+        if value is None:
             raise AttributeError(f"module {old!r} has no attribute {name!r}")
         warnings.warn(f"{old} is now {place}", DeprecationWarning, stacklevel=2)
-        return getattr(module, name)
+        return value
 
     return find
 

@@ -12,11 +12,14 @@ import torch
 from torch import Tensor
 
 from lsmgeo._checks import check_whole, describe
+from lsmgeo._old_names import old_names
 from lsmgeo.cameras import CameraTensors, as_tensors, orbit, resize, unproject_depth
 from lsmgeo.errors import DTypeError, ShapeError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+__getattr__ = old_names(__name__, {"Picture": "Pixels"})
 
 __all__ = ["Pixels", "as_pixels", "as_png", "draw_depth", "draw_points", "draw_voxels", "new_figure", "tile"]
 

@@ -195,7 +195,7 @@ class _Recurrent(nn.Module):
 class ConvGRU3d(_Recurrent):
     """Fuse views in sequence with a gated recurrent unit of 3D convolutions.
 
-    Equation: with * a convolution, LN layer normalisation over channels and voxels with a gain and a shift a channel,
+    Equation: with * a convolution, LN layer normalisation over channels and voxels with a gain and a shift per channel,
     x a view's volume and h the state, 0 before the first view: ``r = sigmoid(LN(W_r * [x, h]))``,
     ``u = sigmoid(LN(W_u * [x, h]))``, ``c = tanh(LN(W_c * [x, r h]))``, ``h' = u h + (1 - u) c`` (Kar, Haene and Malik,
     "Learning a Multi-View Stereo Machine", 2017, section 3; layer norm as in their release).
@@ -249,7 +249,7 @@ class ConvGRU3d(_Recurrent):
 class ConvLSTM3d(_Recurrent):
     """Fuse views in sequence with a long short-term memory of 3D convolutions.
 
-    Equation: with * a convolution, LN layer normalisation over channels and voxels with a gain and a shift a channel,
+    Equation: with * a convolution, LN layer normalisation over channels and voxels with a gain and a shift per channel,
     x a view's volume, h the output and m the memory, both 0 before the first view: ``g, i, f, o = LN(W * [x, h])``,
     each normalised by itself, ``m' = LN(m sigmoid(f + 1) + sigmoid(i) tanh(g))``, ``h' = tanh(m') sigmoid(o)`` (the
     other recurrence of the release of Kar, Haene and Malik, "Learning a Multi-View Stereo Machine", 2017).

@@ -17,12 +17,12 @@ __all__ = ["PlaneSweepProject", "Unproject"]
 
 
 def _as_given(name: str) -> Any:
-    """An option of a layer as it was given; it cannot be set."""
-    return property(lambda self: self.given[name])
+    """An option of a layer as it was given; setting it checks the options again."""
+    return property(lambda self: self.given[name], lambda self, value: self._set_options({**self.given, name: value}))
 
 
 class SamplingLayer(nn.Module):
-    """A layer whose options are checked once, at construction.
+    """A layer whose options are checked when they are set, not at each call.
 
     Attributes:
         options: the checked options, which `forward` passes on.
@@ -36,10 +36,15 @@ class SamplingLayer(nn.Module):
     near = _as_given("near")
     backend = _as_given("backend")
 
-    def __init__(self, who: str, smooth: str, *, backend: str, **given: Any) -> None:
+    def __init__(self, who: str, smooth: str, **given: Any) -> None:
         super().__init__()
-        self.options = kernels.check_options(who, smooth, backend, **given)
-        self.given = {**given, "backend": backend}
+        self.who, self.smooth = who, smooth
+        self._set_options(given)
+
+    def _set_options(self, given: dict[str, Any]) -> None:
+        choices = {name: value for name, value in given.items() if name != "backend"}
+        self.options = kernels.check_options(self.who, self.smooth, given["backend"], **choices)
+        self.given = given
 
     def _options_repr(self) -> str:
         return ", ".join(f"{name}={value!r}" for name, value in self.given.items())

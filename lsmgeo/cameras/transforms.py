@@ -169,7 +169,8 @@ def _facing(who: str, names: str, eye: Tensor, target: Tensor, up: Tensor) -> Te
     if can_inspect(right):
         scale = torch.linalg.vector_norm(forward, dim=-1) * torch.linalg.vector_norm(up, dim=-1)
         if not bool((torch.linalg.vector_norm(right, dim=-1) > 1e-6 * scale).all()):
-            raise CameraError(f"{who}: {names} must span a plane (up is along the viewing direction, or this is 0)")
+            cause = "up is parallel to the viewing direction, or one of them is 0"
+            raise CameraError(f"{who}: {names} must span a plane ({cause})")
     z = forward / torch.linalg.vector_norm(forward, dim=-1, keepdim=True)
     x = right / torch.linalg.vector_norm(right, dim=-1, keepdim=True)
     R = torch.stack(torch.broadcast_tensors(x, cross(z, x), z), -2) + 0.0  # + 0.0: no negative zeros

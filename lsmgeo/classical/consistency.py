@@ -79,8 +79,9 @@ def consistent_views(
     with torch.no_grad():
         y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         own = torch.stack((x, y), -1).reshape(-1, 2)
-        start, known = depth.double().reshape(-1), depth.reshape(-1) > 0
-        points = unproject_depth(camera, depth.double()[None, None]).reshape(1, -1, 3)
+        depth = torch.where((depth > 0) & depth.isfinite(), depth, 0.0).double()
+        start, known = depth.reshape(-1), depth.reshape(-1) > 0
+        points = unproject_depth(camera, depth[None, None]).reshape(1, -1, 3)
         count = torch.zeros(height * width, dtype=torch.int64)
         for other, other_camera in zip(other_depths, other_cameras, strict=True):
             seen_by = resize(other_camera.to(torch.float64), *other.shape)

@@ -232,7 +232,7 @@ def aggregate_views(
     check_float("aggregate_views", "costs", costs, "(V-1, P, h, w)", rank=4)
     check_mask("aggregate_views", "visible", visible, tuple(costs.shape), "of the shape of costs")
     number = costs.shape[0]
-    best, min_views = _numbers(number, best, min_views)
+    best, min_views = _numbers("aggregate_views", number, best, min_views)
     count = visible.sum(0)
     if number == 1:
         return torch.where(visible[0], costs[0], INVALID_COST), count
@@ -250,7 +250,7 @@ def aggregated_costs(
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """`aggregate_views` of `matching_costs`, slab by slab: costs (d, h, w) float32, and whether enough see a site."""
     reference, slabs = warp_neighbours(images, cameras, depths, planes_per_slab, options)
-    best, min_views = _numbers(len(images) - 1, options.best, options.min_views)
+    best, min_views = _numbers("sweep", len(images) - 1, options.best, options.min_views)
     is_plain = images.device.type == "cpu" and images.dtype == torch.float32 and not torch.is_grad_enabled()
     if options.score != "zncc" or not is_plain:
         compare = _comparison(options, reference)
@@ -271,6 +271,6 @@ def aggregated_costs(
         yield cost, seen
 
 
-def _numbers(neighbours: int, best: int | None, min_views: int) -> tuple[int, int]:
-    best = check_whole("aggregate_views", "best", (neighbours + 1) // 2 if best is None else best, 1, neighbours)
-    return best, check_whole("aggregate_views", "min_views", min_views, 1, neighbours)
+def _numbers(who: str, neighbours: int, best: int | None, min_views: int) -> tuple[int, int]:
+    best = check_whole(who, "best", (neighbours + 1) // 2 if best is None else best, 1, neighbours)
+    return best, check_whole(who, "min_views", min_views, 1, neighbours)

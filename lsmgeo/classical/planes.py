@@ -57,9 +57,11 @@ def sweep_planes(cameras: Cameras, near: float, far: float, num: int = 300, spac
     if spacing != "disparity":
         return depth_planes(*ends, num, spacing=spacing)
     depth_planes(*ends, 2)  # checks them
-    number = math.ceil(longest_path(cameras, near, far)) + 1
+    path = longest_path(cameras, near, far)
+    number = math.ceil(path) + 1
     if number > MOST_PLANES:
-        raise OptionError(f"{who}: near must be larger: steps of a pixel would take {number} planes")
+        cause = "a neighbour has part of the range behind it" if path >= ENDLESS else f"steps take {number} planes"
+        raise OptionError(f"{who}: near must be larger for steps of a pixel: {cause}")
     return depth_planes(*ends, max(number, 3), spacing="inverse")
 
 

@@ -131,7 +131,7 @@ def reconstruct_scene(
     score: str = "zncc",
     window: int = 5,
     filtered: bool = True,
-    density: float = 0.8,
+    density: float = SCENE_DENSITY,
     min_support: int | None = None,
     mesh: bool = True,
     resolution: int = 192,

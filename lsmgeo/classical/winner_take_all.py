@@ -27,17 +27,17 @@ class WinnerTakeAll:
     Args:
         depths: (P,) of the planes, ascending.
         size: (h, w).
-        unrelated: the cost of a site that no neighbour sees; only lower costs can win.
+        invalid_cost: the cost of a site that no neighbour sees; only lower costs can win.
         apart: planes within which minima are one.
     """
 
-    def __init__(self, depths: Tensor, size: tuple[int, int], unrelated: float, apart: float = SAME_PLANES):
+    def __init__(self, depths: Tensor, size: tuple[int, int], invalid_cost: float, apart: float = SAME_PLANES):
         self.inverse = (1 / depths.detach().cpu().double()).numpy()
         self.apart = max(apart, SAME_PLANES)
         self.count = 0
         self.before: tuple[Floats, Mask] = (np.empty((0, *size), np.float32), np.empty((0, *size), np.bool_))
-        self.best: Floats = np.full(size, unrelated, np.float32)
-        self.second: Floats = np.full(size, unrelated, np.float32)
+        self.best: Floats = np.full(size, invalid_cost, np.float32)
+        self.second: Floats = np.full(size, invalid_cost, np.float32)
         self.place: Floats = np.full(size, -1, np.float32)
 
     def push(self, costs: Tensor, seen: Tensor) -> None:

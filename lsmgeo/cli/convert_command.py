@@ -23,7 +23,7 @@ def convert(
             3D-R2N2.
         to: "colmap" is a COLMAP model as text, "transforms" a transforms.json of instant-ngp and nerfstudio, "cameras"
             a plain JSON of K and world-to-camera matrices; "shards" is a training set, as from lsmgeo render.
-        out: folder for the images and their cameras; it must not exist, or be empty. Run again, shards are continued.
+        out: folder for the images and their cameras; it must be new or empty. Run again, shards are continued.
         splits: for shards, a splits.json with the splits; by default they follow from the names.
         jobs: for shards, worker processes; -1 uses all cores.
     """

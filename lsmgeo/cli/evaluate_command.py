@@ -45,9 +45,9 @@ def evaluate(
         views: the largest number of views; by default as in the paper: 8, 4 for backgrounds, pose-noise and sequences,
             10 for depth, 20 for clouds.
         out: folder for the results; created if it does not exist.
-        seed: of the order of views and of noise.
+        seed: seed of the order of views and of noise.
         batch: shapes at a time.
-        threshold: of probabilities, for IoU.
+        threshold: threshold on probabilities, for IoU.
         background: for backgrounds: random, or a folder of images.
         degrees: for pose-noise, the largest angles, separated by commas.
         orders: for order, the number of orders.

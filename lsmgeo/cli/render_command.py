@@ -40,7 +40,7 @@ def render(
         voxels: resolutions of the occupancy grids, such as 32 or 32,64.
         depth: whether to write depth.
         shadows: whether shapes cast shadows on themselves.
-        seed: of shapes, lights and views.
+        seed: seed of shapes, lights and views.
         per_shard: shapes in a shard.
         jobs: worker processes; -1 uses all cores.
         cluster: address of a Dask scheduler with workers that have access to the same folders; by default only this

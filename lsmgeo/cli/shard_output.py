@@ -16,7 +16,7 @@ def count_jobs(jobs: int) -> int:
     from importlib.util import find_spec
 
     if jobs == -1 and not find_spec("joblib"):
-        print("lsmgeo: one process works; install joblib (of the extra data) to use all cores", file=sys.stderr)
+        print("lsmgeo: using one process; install lsmgeo[data] to use all cores", file=sys.stderr)
         return 1
     return jobs
 

@@ -97,7 +97,7 @@ def examine_images(scene: PosedImages) -> Examination:
     if cause is None:
         shifts = find_shifts(evidence, stated.cameras)
         half, corrected = _half_a_pixel(shifts, stated)
-        # Half a pixel may make one view an outlier; with the correction it is none.
+        # Half a pixel may make one view an outlier; with the correction it is not.
         if outliers is None or half is None:
             checks, cause = with_views, half or outliers
         elif _check_single_views(scene, checks, evidence, corrected)[1] is None:

@@ -30,7 +30,7 @@ __all__ = ["Explanation", "explain", "invisible_errors", "is_decisive", "is_susp
 
 # Factor by which an error that stays above its limit must fall; score differences that count as equal.
 DECISIVE, TIE, RIVAL = 4.0, 0.05, 0.35
-# Multiples of the limit: a check passes up to the first, and is looked into from the second.
+# Multiples of the limit: a check passes up to the first, and is examined further from the second.
 PASSED = 1.0
 SUSPICIOUS = 0.5
 FINALISTS = 16

@@ -84,9 +84,10 @@ def _depths(methods: Sequence[Method], batch: Batch, count: int, options: Option
 
 
 def joint_cloud(depth: Tensor, images: Tensor, cameras: CameraTensors) -> tuple[np.ndarray, np.ndarray]:
-    """The points (N, 3) of all pixels with depth (V, H, W), not 0, and their colours (N, 3) uint8."""
-    has_depth = depth > 0
-    points = unproject_depth(cameras.at(slice(len(depth))), depth.double()[None])[0]
+    """The points (N, 3) of all pixels with a positive, finite depth (V, H, W), and their colours (N, 3) uint8."""
+    has_depth = (depth > 0) & depth.isfinite()
+    filled = torch.where(has_depth, depth, 0.0).double()
+    points = unproject_depth(cameras.at(slice(len(depth))), filled[None])[0]
     return points[has_depth].numpy(), np.stack([as_pixels(image) for image in images[: len(depth)]])[has_depth]
 
 

@@ -199,7 +199,7 @@ class DepthLSM(LSMTrunk):
                 x = torch.cat((_repeat(early[level], S).flatten(0, 1).to(x.dtype), x), 1)
             x = block(x)
         with torch.autocast(x.device.type, enabled=False):
-            depth = self.out(x.to(self.out.convolution.weight.dtype)).squeeze(1).unflatten(0, (B, S, -1))
+            depth = self.out(x.to(self.out.convolution.weight.dtype)).squeeze(1).unflatten(0, (B, S, targets.shape[1]))
         return DepthOutput(depth if mask is None else torch.where(mask[:, None, :, None, None], depth, 0.0))
 
     def run(

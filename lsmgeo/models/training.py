@@ -1,5 +1,5 @@
 """The old place of `lsmgeo.training`, for this version."""
 
-from lsmgeo._old_names import moved_to
+from lsmgeo._old_names import moved_to as _moved_to
 
-__getattr__ = moved_to("lsmgeo.training", __name__)
+__getattr__ = _moved_to("lsmgeo.training", __name__)

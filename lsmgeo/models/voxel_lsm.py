@@ -237,7 +237,8 @@ class LSMTrunk(Model):
     def _check(self, images: Tensor, view_mask: Tensor | None) -> int:
         """Check images and mask; the number of views."""
         stride = self.image_stride
-        expected = f"(B, V, 3, H, W), V at least 1, H and W multiples of {stride}, at least {2 * stride}"
+        sides = f"H and W multiples of {stride}, at least {2 * stride}" if stride > 1 else "H and W at least 2"
+        expected = f"(B, V, 3, H, W), V at least 1, {sides}"
         check_float(self.name, "images", images, expected, 5)
         _, V, channels, height, width = images.shape
         if V < 1 or channels != 3 or height % stride or width % stride or min(height, width) < 2 * stride:

@@ -26,7 +26,7 @@ from lsmgeo.grids import VoxelGrid
 from lsmgeo.models.depth_lsm import DepthLSM
 from lsmgeo.models.voxel_lsm import VoxelLSM
 from lsmgeo.models.weights import load
-from lsmgeo.reconstruct.hull_method import colour_vertices, hull_depth, silhouette_iou
+from lsmgeo.reconstruct.hull_method import SPECK_FACES, colour_vertices, hull_depth, silhouette_iou
 from lsmgeo.reconstruct.object_frame import (
     DISTANCE,
     Crop,
@@ -60,7 +60,6 @@ REACH = 3**0.5 / 2
 FINER, FINEST = 4, 128
 # The relative difference within which depth maps agree, and the truncation of fusing in sizes of the object.
 AGREEMENT, TRUNCATION = 0.02, 0.05
-SPECK_FACES = 20
 # On the validation split: a network below this IoU, or above this depth error, is barely trained.
 LEAST_IOU, LARGEST_ERROR = 0.3, 0.1
 # The size of the map of largest probabilities in pixels, and the samples along each ray.

@@ -38,7 +38,7 @@ def open_scene(
         expected = "" if isinstance(view, int) else " or be the name of an image"
         raise OptionError(f"view must lie in 0..{len(scene) - 1}{expected}; got {view!r}")
     if any(image.resolve().is_relative_to(Path(out).resolve()) for image in scene.paths):
-        raise OptionError(f"out must be a folder without the images, which it could replace; got {os.fspath(out)!r}")
+        raise OptionError(f"out must not contain the images, which could be overwritten; got {os.fspath(out)!r}")
     scene, notes = _readable(scene)
     if name is not None and name not in scene.names:
         raise OptionError(f"view must be an image that can be read: {notes[0]}")
@@ -84,7 +84,7 @@ def _readable(scene: PosedImages) -> tuple[PosedImages, tuple[str, ...]]:
         lenses=None if scene.lenses is None else tuple(scene.lenses[view] for view in kept),
         depths=None if scene.depths is None else tuple(scene.depths[view] for view in kept),
     )
-    return fewer, (f"Left out, as it cannot be read: {first_few(reasons)}",)
+    return fewer, (f"Left out, unreadable: {first_few(reasons)}",)
 
 
 def first_few(reasons: list[str]) -> str:

@@ -181,7 +181,7 @@ def _take_steps(run: Run, batches: Iterator[Batch]) -> str:
             )
         if progress.step == 1:
             log.say(f"step 1: loss {gradients.loss:.4f}")
-        log.progress(progress.step, f"loss {gradients.loss:.4f}, {seconds:.2f} s a step")
+        log.progress(progress.step, f"loss {gradients.loss:.4f}, {seconds:.2f} s per step")
 
 
 def _skip_step(run: Run, gradients: Gradients, taken: Sequence[Batch]) -> None:

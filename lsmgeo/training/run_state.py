@@ -163,7 +163,7 @@ class Run:
         self.log.say(
             f"{self.model.name}, {weights:,} parameters, on {device}"
             f"{f', {self.processes} processes' if self.processes > 1 else ''}: {len(self.shapes)} shapes, "
-            f"{self.shapes_per_step} a step; evaluated on {self.evaluated_shapes}"
+            f"{self.shapes_per_step} per step; evaluated on {self.evaluated_shapes}"
             f"{'' if self.checkpoint is None else f'; resumes at step {step} from {self.checkpoint.path}'}"
         )
 

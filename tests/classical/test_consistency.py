@@ -142,6 +142,17 @@ def test_nothing_agrees_with_nothing(scene):
     assert int(consistent_views(maps, camera, [], []).sum()) == 0
 
 
+@pytest.mark.parametrize("missing", [float("nan"), float("inf"), -1.0])
+def test_no_number_agrees_with_nothing(scene, missing):
+    maps, camera = torch.from_numpy(scene.depth[0]), camera_of(scene, 0)
+    holes = maps.clone()
+    holes[::2] = missing
+    for own, other in ((holes, maps), (maps, holes)):
+        found = consistent_views(own, camera, [other], [camera])
+        assert int(found[::2].sum()) == 0
+    assert int(consistent_views(holes, camera, [maps], [camera])[1::2].sum()) > 0
+
+
 def test_wrong_arguments_are_named(scene):
     depth, camera = torch.from_numpy(scene.depth[0]), camera_of(scene, 0)
     with pytest.raises(ShapeError, match="other_cameras must be as many as other_depths, 1; got 0"):

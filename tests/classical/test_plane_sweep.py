@@ -276,7 +276,7 @@ def test_three_hundred_planes_by_default():
         ({"num": 2}, OptionError, "num must be a whole number from 3"),
         ({"near": "1"}, OptionError, "near must be a number; got str '1'"),
         ({"far": None}, OptionError, "far must be a number; got NoneType"),
-        ({"near": 1e-6, "spacing": "disparity"}, OptionError, "near must be larger: steps of a pixel would take"),
+        ({"near": 1e-6, "spacing": "disparity"}, OptionError, "near must be larger for steps of a pixel: "),
         ({"near": 4.0}, GridError, "near and far must be positive, finite and ascending"),
         ({"near": -1.0, "spacing": "disparity"}, GridError, "near and far must be positive, finite and ascending"),
     ],

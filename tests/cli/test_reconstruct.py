@@ -194,7 +194,7 @@ def test_a_damaged_image_is_left_out_and_named(scene, tmp_path, capsys):
     arguments = ["reconstruct", str(folder), "--planes", "64", "--out", str(out), "--resolution", "32"]
     assert cli.main(arguments) == 0
     said = capsys.readouterr().err
-    assert "warning: Left out, as it cannot be read" in said
+    assert "warning: Left out, unreadable" in said
     assert "v1.png" in said
     depths, entries = read_results(out)
     assert [entry["photograph"] for entry in entries] == ["v0.png", "v2.png", "v4.png", "view_3.png"]
@@ -208,7 +208,7 @@ def test_results_never_replace_the_images(scene, tmp_path, capsys):
     folder = write_colmap(scene, tmp_path / "scene", form="text")
     before = {path: path.read_bytes() for path in folder.rglob("*.png")}
     assert cli.main(["reconstruct", str(folder), "--out", str(folder)]) == 2
-    assert "out must be a folder without the images" in capsys.readouterr().err
+    assert "out must not contain the images" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in folder.rglob("*.png")} == before
 
 

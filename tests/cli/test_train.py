@@ -36,7 +36,7 @@ def test_a_model_is_trained_and_goes_on(configuration, tmp_path, capsys):
     assert f"evaluate:    lsmgeo evaluate {checkpoint}\n" in printed.out
     assert re.search(r"IoU: +\d+\.\d, \d+\.\d % after 1 to 2 views", printed.out)
     assert re.search(r"step 1: loss \d\.\d{4}", printed.err)
-    assert "6 shapes, 2 a step; evaluated on 2" in printed.err
+    assert "6 shapes, 2 per step; evaluated on 2" in printed.err
     assert load(out).name == "voxel-lsm"
     assert cli.main(["train", str(configuration), "--out", str(out), "--quiet", "true"]) == 0
     printed = capsys.readouterr()

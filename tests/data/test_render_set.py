@@ -297,7 +297,7 @@ def test_without_joblib_one_process_works(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     arguments = ["render", "--shapes", "1", "--views", "1", "--size", "16", "--voxels", "8"]
     assert cli.main([*arguments, "--out", str(tmp_path / "set")]) == 0
-    assert "one process works" in capsys.readouterr().err
+    assert "using one process" in capsys.readouterr().err
 
 
 def test_a_cluster_that_does_not_answer_is_named(tmp_path, capsys, monkeypatch):

@@ -20,6 +20,7 @@ from lsmgeo import (
     functional,
 )
 from lsmgeo import rays as along_rays
+from lsmgeo.errors import OptionError
 from tests.abilities import needs_second_derivatives
 from tests.interop.models import GRID, UNPROJECTIONS, ThereAndBack, arguments, assert_same, views
 
@@ -210,6 +211,16 @@ def test_state_of_a_reduction_along_rays():
     convolution = torch.nn.Conv2d(24, 3, 1)
     convolution.load_state_dict(state)
     assert torch.equal(convolution.weight, first.weight)
+
+
+def test_options_of_layers_can_be_set():
+    layer, other = Unproject(VoxelGrid(3)), Unproject(VoxelGrid(3), mode="nearest", near=0.5)
+    layer.mode, layer.near = "nearest", 0.5
+    assert repr(layer) == repr(other)
+    assert layer.options == other.options
+    with pytest.raises(OptionError, match="Unproject: backend must be"):
+        layer.backend = "fast"
+    assert layer.options == other.options
 
 
 def test_layers_print_themselves():

@@ -218,3 +218,9 @@ def test_the_release_s_rules_of_a_sweep():
     # A ray may pass the border of a voxel, where a bit decides.
     assert float((found == expected).all(0).double().mean()) > 0.995
     assert int(inside.sum()) > 50
+
+
+def test_no_scenes(tiny):
+    images, cameras = look(1, 2)
+    output = tiny(images[:0], cameras.at(slice(0, 0)))
+    assert tuple(output.depth.shape) == (0, 2, *images.shape[-2:])

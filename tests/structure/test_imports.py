@@ -130,12 +130,14 @@ def test_old_places_name_the_new_ones(name):
     new = importlib.import_module(f"lsmgeo.{name}")
     with pytest.warns(DeprecationWarning, match=f"lsmgeo.models.{name} is now lsmgeo.{name}"):
         assert all(getattr(old, public) is getattr(new, public) for public in new.__all__)
+    assert old.__all__ == new.__all__  # for ``import *``
     with pytest.raises(AttributeError, match="has no attribute"):
         old.nothing  # noqa: B018
 
 
 OLD_NAMES = [
     ("lsmgeo.data", "Made", "SetResult"),
+    ("lsmgeo.drawing", "Picture", "Pixels"),
     ("lsmgeo.evaluation", "Contender", "Method"),
     ("lsmgeo.evaluation", "open_contenders", "open_methods"),
     ("lsmgeo.models", "MachineSettings", "TrunkSettings"),

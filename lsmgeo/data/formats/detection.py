@@ -52,7 +52,7 @@ class Format(NamedTuple):
     """
 
     name: str
-    kind: Literal["photographs", "voxels", "calibration"]
+    kind: Literal["images", "voxels", "calibration"]
     needs: str
     is_here: Callable[[Path], bool]
     read: Callable[[Path], Any]
@@ -64,18 +64,18 @@ def _is_only_binvox(path: Path) -> bool:
 
 
 FORMATS = (
-    Format("middlebury", "photographs", "a Middlebury *_par.txt", is_middlebury, read_middlebury),
-    Format("colmap", "photographs", "a COLMAP model (cameras and images, .bin or .txt)", is_colmap, read_colmap),
-    Format("rgbd", "photographs", "K.txt, poses.txt and frame_index.txt of an RGB-D set", is_rgbd, read_rgbd),
-    Format("7-scenes", "photographs", "frame-*.pose.txt of 7-Scenes", is_seven_scenes, read_seven_scenes),
-    Format("middlebury-stereo", "photographs", "calib.txt and im0.png of a pair", is_stereo_pair, read_stereo_pair),
-    Format("transforms", "photographs", "a transforms.json (or transforms_*.json)", is_transforms, read_transforms),
-    Format("llff", "photographs", "an LLFF poses_bounds.npy", is_llff, read_llff),
-    Format("cameras", "photographs", "a cameras.json of lsmgeo", is_cameras_json, read_cameras_json),
-    Format("strecha", "photographs", "Strecha's *.camera files", is_strecha, read_strecha),
+    Format("middlebury", "images", "a Middlebury *_par.txt", is_middlebury, read_middlebury),
+    Format("colmap", "images", "a COLMAP model (cameras and images, .bin or .txt)", is_colmap, read_colmap),
+    Format("rgbd", "images", "K.txt, poses.txt and frame_index.txt of an RGB-D set", is_rgbd, read_rgbd),
+    Format("7-scenes", "images", "frame-*.pose.txt of 7-Scenes", is_seven_scenes, read_seven_scenes),
+    Format("middlebury-stereo", "images", "calib.txt and im0.png of a pair", is_stereo_pair, read_stereo_pair),
+    Format("transforms", "images", "a transforms.json (or transforms_*.json)", is_transforms, read_transforms),
+    Format("llff", "images", "an LLFF poses_bounds.npy", is_llff, read_llff),
+    Format("cameras", "images", "a cameras.json of lsmgeo", is_cameras_json, read_cameras_json),
+    Format("strecha", "images", "Strecha's *.camera files", is_strecha, read_strecha),
     Format("opencv", "calibration", "calibration files of OpenCV's FileStorage", is_calibration, read_calibration),
-    Format("lsm", "photographs", "render_*.png and camera_*.mat of the LSM release", is_lsm, read_lsm),
-    Format("r2n2", "photographs", "rendering_metadata.txt of 3D-R2N2", is_r2n2, read_r2n2),
+    Format("lsm", "images", "render_*.png and camera_*.mat of the LSM release", is_lsm, read_lsm),
+    Format("r2n2", "images", "rendering_metadata.txt of 3D-R2N2", is_r2n2, read_r2n2),
     Format("binvox", "voxels", "a *.binvox file", _is_only_binvox, read_binvox),
 )
 
@@ -136,6 +136,6 @@ def open_scene(path: str | Path) -> PosedImages:
         DataError: the path does not exist, is of no known format or of several, or cannot be read.
     """
     found = detect(path)
-    if found.kind != "photographs":
+    if found.kind != "images":
         raise DataError(path, f"holds {found.needs}, but no posed images")
     return cast("PosedImages", found.read(Path(path)))

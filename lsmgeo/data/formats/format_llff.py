@@ -115,7 +115,7 @@ def _intrinsics(stated: np.ndarray, size: tuple[int, int], file: Path, where: st
     """K of an image, half-integer pixel centres, scaled from the resolution of its row."""
     height, width, focal = (float(value) for value in stated)
     if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE and 0 < focal <= MAX_PARAMETER):
-        reason = f"{width:g} x {height:g} pixels (width x height) with a focal length of {focal:g} are not a camera"
+        reason = f"{width:g} x {height:g} pixels (width x height) with a focal length of {focal:g} is no valid camera"
         raise DataError(file, f"{where}: {reason}")
     down, across = size[0] / height, size[1] / width
     # The sides of a reduced image are rounded to integers, so the aspect ratio may differ by one pixel.

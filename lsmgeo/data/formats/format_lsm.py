@@ -108,7 +108,7 @@ def read_lsm_object(folder: Path, resolutions: Sequence[int]) -> tuple[PosedImag
 def read_mat_files(paths: Sequence[Path]) -> list[Arrays | DataError]:
     """K, extrinsic and Volume of each MATLAB file (up to version 7.2), if it has them; or the error of the file."""
     if find_spec("scipy") is None:
-        raise OptionError("read_mat_files: MATLAB files need SciPy; install lsmgeo[data]")
+        raise OptionError("read_lsm: MATLAB files need SciPy; install scipy")
     results = parse_isolated(parse_mat, paths, limit=MAX_MAT_BYTES, memory=MEMORY, seconds=SECONDS)
     for number, (path, found) in enumerate(zip(paths, results, strict=True)):
         if isinstance(found, dict):

@@ -17,7 +17,7 @@ __all__ = ["is_storage", "parse_storage"]
 
 SUFFIXES = (".yml", ".yaml", ".xml", ".json")
 MATRIX = re.compile(rb"opencv-(nd-)?matrix")
-PICTURE = re.compile(rb"\.(png|jpe?g)\b", re.IGNORECASE)
+IMAGE_NAME = re.compile(rb"\.(png|jpe?g)\b", re.IGNORECASE)
 MOST_ENTRIES = 1000
 MOST_VALUES = 20_000
 MOST_TEXT = 512
@@ -33,7 +33,7 @@ def is_storage(path: Path) -> bool:
         return b"<opencv_storage>" in start
     if path.suffix.lower() == ".json":
         return start.startswith(b"{") and MATRIX.search(start) is not None
-    return start.startswith(b"%YAML") and (MATRIX.search(start) or PICTURE.search(start)) is not None
+    return start.startswith(b"%YAML") and (MATRIX.search(start) or IMAGE_NAME.search(start)) is not None
 
 
 def parse_storage(content: bytes) -> dict[str, np.ndarray]:

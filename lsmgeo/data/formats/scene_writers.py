@@ -40,7 +40,7 @@ def write_colmap(images: PosedImages, folder: str | PathLike[str]) -> Path:
 
     Args:
         images: the images, with their sparse points and observations.
-        folder: the folder to make, atomically; it must not exist, or be empty.
+        folder: the folder to make, atomically; it must be new or empty.
 
     Returns:
         The folder.
@@ -80,7 +80,7 @@ def write_transforms(images: PosedImages, folder: str | PathLike[str]) -> Path:
 
     Args:
         images: the images.
-        folder: the folder to make, atomically; it must not exist, or be empty.
+        folder: the folder to make, atomically; it must be new or empty.
 
     Returns:
         The folder.

@@ -97,7 +97,7 @@ def consistent_views(
 
 def _depth_at(depth: Tensor, pixels: Tensor, z: Tensor, known: Tensor) -> Tensor:
     """Depth (N,) of a map between its pixels, 0 where one of the four neighbours has none."""
-    has = depth > 0
+    has = (depth > 0) & depth.isfinite()
     layers = torch.stack((torch.where(has, 1 / torch.where(has, depth, 1.0), 0.0), has.to(depth.dtype)))
     # Inverse depths are interpolated in float64, so that planes stay planes.
     sampled = functional.sample_views(

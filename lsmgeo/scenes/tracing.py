@@ -118,7 +118,7 @@ class CameraRays:
 
         self.points, self.directions = separate(point), separate(direction)
         self.depth = depth[:, None, None].to(dtype)
-        # A single view skips pixels that a solid cannot cover.
+        # A single view skips pixels that a primitive cannot cover.
         single = len(cameras.center) == 1
         self.windows = _windows(tables, rows, cameras, views, size, near) if single else None
 
@@ -132,7 +132,7 @@ class CameraRays:
         return point, direction, self.depth[which]
 
     def window(self, row: int, view: int) -> Window | None:
-        """The pixels where a solid can be hit; None without any."""
+        """The pixels where a primitive can be hit; None without any."""
         if self.windows is None:
             return EVERYTHING
         top, bottom, left, right = self.windows[self.index[row, view]]

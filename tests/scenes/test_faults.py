@@ -36,7 +36,7 @@ FAULTS = {
     ),
     "one round of cuts": (tracing, "for _ in cuts:", "for _ in cuts[:1]:"),
     "the farthest hit": (tracing, "closer &= start < before", "closer &= (start > before) | before.isinf()"),
-    "windows too small": (tracing, "ceil() + 2)", "ceil() - 1)"),
+    "windows too small": (tracing, ".windows(world,", ".windows(0.5 * (world + tables.center[rows, None]),"),
     "half a pixel": (tracing, "count, dtype=torch.float64, device=device)", "count, dtype=torch.float64) + 0.5"),
     "another depth": (rendering, "torch.where(mask, nearest, 0.0)", "torch.where(mask, 1.01 * nearest, 0.0)"),
     "cuts filled": (inside, "inside &= ~_contains", "inside |= _contains"),

@@ -14,7 +14,7 @@ from lsmgeo._checks import check_devices, check_float, describe
 from lsmgeo._linalg import affine_inverse, multiply
 from lsmgeo.cameras.camera_checks import check_views, image_size, views_per_scene
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
-from lsmgeo.cameras.tensors import Cameras, as_tensors
+from lsmgeo.cameras.tensors import Cameras, as_tensors, leading_shape
 from lsmgeo.errors import DTypeError, ShapeError
 from lsmgeo.grids import FrustumGrid, Lattice, VoxelGrid, check_depths
 from lsmgeo.kernels.request import Options, Sites
@@ -42,7 +42,7 @@ def check_features(who: str, features: Tensor, count: int | None = None) -> tupl
 def image_matrices(who: str, features: Tensor, cameras: Cameras, view_mask: Tensor | None) -> CameraMatrices:
     """The cameras (B, V) of a feature map, checked, K resized to it."""
     tensors = as_tensors(cameras, who)
-    views = check_features(who, features, prod(tensors.shape))
+    views = check_features(who, features, prod(leading_shape(tensors)))
     tensors = check_views(who, tensors, views, view_mask, features=features)
     return camera_matrices(tensors, (features.shape[3], features.shape[4]), view_mask)
 

@@ -29,7 +29,7 @@ from lsmgeo._linalg import affine_inverse, basis_row, homogeneous_row, inverse_3
 from lsmgeo._torch_compat import is_exporting
 from lsmgeo.cameras.camera_checks import check_cameras, image_size
 from lsmgeo.cameras.matrices import camera_matrices
-from lsmgeo.cameras.tensors import Cameras, as_tensors
+from lsmgeo.cameras.tensors import Cameras, as_tensors, leading_shape
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import DTypeError, GridError, ShapeError
 
@@ -247,7 +247,7 @@ class FrustumGrid:
         """Check and normalise the fields."""
         who = "FrustumGrid"
         camera = as_tensors(self.camera, who)
-        leading = camera.shape
+        leading = leading_shape(camera)
         if len(leading) > 1:
             raise ShapeError(
                 f"{who}: camera must have leading shape () or (B,), one per scene, see cameras.select; got {leading}"

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import os
+import runpy
 import sys
 from collections.abc import Generator
 from pathlib import Path
@@ -49,8 +50,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def pytest_make_collect_report(
     collector: pytest.Collector,
 ) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
-    """Fail where a test file cannot be imported: the doctest plugin skips it, and pytest then finds no tests in it."""
+    """Fail where a test file cannot import what is ours: the doctest plugin skips it, and pytest finds no test in it."""
     report = yield
     if report.skipped and "unable to import module" in str(report.longrepr) and collector.path.name.startswith("test_"):
-        report.outcome = "failed"
+        try:
+            runpy.run_path(str(collector.path))
+        except ImportError as error:
+            if (error.name or "").split(".")[0] in ("", "lsmgeo", "tests"):
+                report.outcome, report.longrepr = "failed", f"{collector.path}: {error!r}"
     return report

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lsmgeo._checks import check_devices, check_mask, check_size
 from lsmgeo._linalg import multiply
-from lsmgeo.cameras.tensors import CameraTensors, image_sizes
+from lsmgeo.cameras.tensors import CameraTensors, image_sizes, leading_shape
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, ShapeError
 
@@ -88,7 +88,7 @@ def image_size(who: str, cameras: CameraTensors, size: tuple[int, int] | None = 
 
 def views_per_scene(who: str, cameras: CameraTensors, scenes: int, whose: str) -> tuple[int, int]:
     """(B, V) of cameras (B, V) or (B*V,) beside B scenes of another argument, which `whose` names in errors."""
-    leading = cameras.shape
+    leading = leading_shape(cameras)
     if len(leading) == 2:
         views = (leading[0], leading[1])
         if leading[0] != scenes:
@@ -109,7 +109,7 @@ def views_per_scene(who: str, cameras: CameraTensors, scenes: int, whose: str) -
 
 def views_of(who: str, cameras: CameraTensors, views: tuple[int, int]) -> CameraTensors:
     """Cameras (B, V) or (B*V,), view fastest, with leading shape (B, V)."""
-    leading = cameras.shape
+    leading = leading_shape(cameras)
     if leading != views and leading != (views[0] * views[1],):
         raise ShapeError(
             f"{who}: cameras must have leading shape (B, V) = {views}, or (B*V,) with the view fastest; got {leading}"

@@ -51,7 +51,7 @@ class CameraTensors(NamedTuple):
     @property
     def shape(self) -> tuple[int, ...]:
         """The leading shape: (B, V), (V,), ()."""
-        return tuple(self.cam_from_world.shape[:-2])
+        return leading_shape(self)
 
     @property
     def device(self) -> torch.device:
@@ -164,7 +164,7 @@ def as_tensors(cameras: Cameras, who: str = "cameras") -> CameraTensors:
             f"{who}: cameras.cam_from_world must be (..., 4, 4), the whole world-to-camera matrix; "
             f"got {tuple(cam_from_world.shape)}"
         )
-    leading = cameras.shape
+    leading = leading_shape(cameras)
     if tuple(intrinsics.shape[:-2]) != leading:
         raise ShapeError(
             f"{who}: cameras.intrinsics and cameras.cam_from_world must agree in their leading shape; "
@@ -179,6 +179,11 @@ def as_tensors(cameras: Cameras, who: str = "cameras") -> CameraTensors:
     width = _size(who, "width", cameras.width, leading, intrinsics)
     check_devices(who, intrinsics=intrinsics, cam_from_world=cam_from_world, height=height, width=width)
     return CameraTensors(intrinsics[..., :3, :3], cam_from_world, height, width)
+
+
+def leading_shape(cameras: CameraTensors) -> tuple[int, ...]:
+    """`CameraTensors.shape`, also under `torch.compile`: PyTorch 2.6 does not trace properties of named tuples."""
+    return tuple(cameras.cam_from_world.shape[:-2])
 
 
 def image_sizes(cameras: CameraTensors) -> tuple[Tensor, Tensor]:
@@ -264,7 +269,7 @@ def select(cameras: Cameras, dim: int, index: int) -> CameraTensors:
         (2, 3, 3)
     """
     tensors = as_tensors(cameras, "select")
-    leading = tensors.shape
+    leading = leading_shape(tensors)
     if not is_whole(dim) or not 0 <= dim < len(leading):
         raise ShapeError(f"select: dim must be a leading axis of {leading}; got {describe(dim)}")
     if not is_whole(index) or not -leading[dim] <= index < leading[dim]:

@@ -23,7 +23,7 @@ from lsmgeo._checks import (
 from lsmgeo._linalg import cross, homogeneous_row, multiply, transform
 from lsmgeo.cameras.camera_checks import check_cameras
 from lsmgeo.cameras.matrices import pinhole_matrix, resize_matrix
-from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes, leading_shape
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, DeviceError, DTypeError, OptionError, ShapeError
 
@@ -92,7 +92,7 @@ def crop(cameras: Cameras, top: int | Tensor, left: int | Tensor, height: int, w
     """
     height, width = check_size("crop", "(height, width)", (height, width), 2, "two integers")
     tensors = as_tensors(cameras, "crop")
-    K, leading = tensors.intrinsics, tensors.shape
+    K, leading = tensors.intrinsics, leading_shape(tensors)
     x, y = (_number("crop", name, side, K, leading).to(K.dtype) for name, side in (("left", left), ("top", top)))
     check_devices("crop", cameras=K, left=x, top=y)
     offset = torch.stack((x.expand(leading), y.expand(leading)), -1)[..., None]
@@ -275,7 +275,7 @@ def perturb(
     if generator is not None and not isinstance(generator, torch.Generator):
         raise DTypeError(f"{who}: generator must be a torch.Generator or None; got {describe(generator)}")
     tensors = as_tensors(cameras, who)
-    E, leading = tensors.cam_from_world, tensors.shape
+    E, leading = tensors.cam_from_world, leading_shape(tensors)
     if generator is not None and generator.device.type != E.device.type:
         raise DeviceError(f"{who}: generator must be on the cameras' {E.device}; got one on {generator.device}")
     target = _vector(who, "target", target, E)

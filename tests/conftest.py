@@ -50,7 +50,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def pytest_make_collect_report(
     collector: pytest.Collector,
 ) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
-    """Fail where a test file cannot import what is ours: the doctest plugin skips it, and pytest finds no test in it."""
+    """Fail where a test file cannot import what is ours: the doctest plugin would skip it, unnoticed."""
     report = yield
     if report.skipped and "unable to import module" in str(report.longrepr) and collector.path.name.startswith("test_"):
         try:

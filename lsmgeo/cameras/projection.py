@@ -141,7 +141,7 @@ def centers(cameras: Cameras) -> Tensor:
     """
     tensors = as_tensors(cameras, "centers")
     check_cameras("centers", tensors)
-    return (camera_matrices(tensors).center + 0.0).to(tensors.dtype)
+    return (camera_matrices(tensors).center + 0.0).to(tensors.intrinsics.dtype)
 
 
 def rays(cameras: Cameras, size: tuple[int, int] | None = None) -> tuple[Tensor, Tensor]:
@@ -174,4 +174,4 @@ def rays(cameras: Cameras, size: tuple[int, int] | None = None) -> tuple[Tensor,
     matrices = camera_matrices(tensors, size)
     steps = matrices.pixel_steps(*size)
     directions = steps / torch.linalg.vector_norm(steps, dim=-1, keepdim=True)
-    return (matrices.center + 0.0).to(tensors.dtype), directions.to(tensors.dtype)
+    return (matrices.center + 0.0).to(tensors.intrinsics.dtype), directions.to(tensors.intrinsics.dtype)

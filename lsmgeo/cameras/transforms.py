@@ -62,7 +62,7 @@ def resize(cameras: Cameras, height: int, width: int) -> CameraTensors:
     """
     height, width = check_size("resize", "(height, width)", (height, width), 2, "two integers")
     tensors = as_tensors(cameras, "resize")
-    scale = resize_matrix(*image_sizes(tensors), height, width, tensors.dtype)
+    scale = resize_matrix(*image_sizes(tensors), height, width, tensors.intrinsics.dtype)
     return _of_size(tensors, multiply(scale, tensors.intrinsics), height, width)
 
 

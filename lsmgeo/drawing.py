@@ -173,7 +173,8 @@ def draw_depth(
     known = np.isfinite(z) & (z > 0)
     filled = torch.from_numpy(np.where(known, z, 1.0)).to(camera.device)  # depth 1 for no depth
     points = unproject_depth(camera.at(None), filled[None, None])[0, 0].cpu().numpy()
-    pixel = float(np.median(z[known]) if known.any() else 1.0) / float(resize(camera, *depth.shape).intrinsics[0, 0])
+    focal = float(torch.linalg.vector_norm(resize(camera, *depth.shape).intrinsics[0, :2]))
+    pixel = float(np.median(z[known]) if known.any() else 1.0) / focal
     ends = [(rows, columns) for rows in (slice(-1), slice(1, None)) for columns in (slice(-1), slice(1, None))]
     corners = np.stack([points[end] for end in ends], 2)
     is_whole = np.logical_and.reduce([known[end] for end in ends])

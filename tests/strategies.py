@@ -21,6 +21,12 @@ from tests import oracle
 
 Array = npt.NDArray[np.float64]
 
+IMAGE_TRANSFORMS = np.array(
+    [
+        *([[1.0, 0.0], [0.0, 1.0]],) * 4,
+        *([[-1.0, 0.0], [0.0, 1.0]], [[0.0, -1.0], [1.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.9, 0.2], [-0.3, 1.1]]),
+    ]
+)
 PLACEMENTS = ("facing", "grazing", "inside", "behind", "on_site", "on_pixel", "on_border")
 OUTSIDE = ("facing", "grazing", "on_pixel", "on_border")
 
@@ -151,6 +157,9 @@ def _cameras(
     intrinsics[:, 0, 0] = focal
     intrinsics[:, 0, 1] = focal * (-0.4 + 0.8 * numbers[:, 9])
     intrinsics[:, 1, 1] = focal * (0.5 + 1.5 * numbers[:, 10])
+    # Every other image is flipped, rolled by a quarter turn or sheared, as augmentation leaves it.
+    kind = (7.99 * numbers[:, 9]).astype(np.int64)
+    intrinsics[:, :2, :2] = IMAGE_TRANSFORMS[kind] @ intrinsics[:, :2, :2]
     intrinsics[:, :2, 2] = (0.2 + 0.6 * numbers[:, 11:13]) * image[:, ::-1]
     intrinsics[:, 2, 2] = 1.0
 

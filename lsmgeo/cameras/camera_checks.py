@@ -24,7 +24,7 @@ def rotation_error(R: Tensor) -> Tensor:
 def check_cameras(who: str, cameras: CameraTensors, view_mask: Tensor | None = None) -> None:
     """Raise a `CameraError` that names the first bad camera, if the values may be read (see `lsmgeo.debug`).
 
-    Checked: finite values; K with positive focal lengths, no vertical skew and last row (0, 0, 1); rigid, unmirrored
+    Checked: finite values; K invertible, with last row (0, 0, 1): images may be flipped or rolled; rigid, unmirrored
     extrinsics (``max |R^T R - I| <= 1e-3``, det R > 0) with last row (0, 0, 0, 1); sizes of at least one pixel.
 
     Args:
@@ -41,8 +41,8 @@ def check_cameras(who: str, cameras: CameraTensors, view_mask: Tensor | None = N
         R = E[..., :3, :3]
         residual = rotation_error(R)
         triple = (R[..., 0, :] * torch.linalg.cross(R[..., 1, :], R[..., 2, :])).sum(-1)
-        focal = torch.minimum(K[..., 0, 0], K[..., 1, 1])
-        smallest = 1e-6 * torch.maximum(height, width)
+        determinant = K[..., 0, 0] * K[..., 1, 1] - K[..., 0, 1] * K[..., 1, 0]
+        smallest = 1e-12 * torch.maximum(height, width).double().square()
         last_k = (K[..., 2, :] - K.new_tensor([0.0, 0.0, 1.0])).abs().amax(-1)
         last_e = (E[..., 3, :] - E.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax(-1)
         rules = (
@@ -51,8 +51,11 @@ def check_cameras(who: str, cameras: CameraTensors, view_mask: Tensor | None = N
             ("cam_from_world must be finite", E.isfinite().all(-1).all(-1), None),
             ("height and width must be at least 1 pixel", (height >= 1) & (width >= 1), None),
             ("intrinsics must have the last row (0, 0, 1); its largest deviation is", last_k <= 1e-3, last_k),
-            ("focal lengths must be positive pixels, 1e-6 of the image size at least; got", focal > smallest, focal),
-            ("intrinsics[1, 0] must be 0; got", K[..., 1, 0].abs() <= 1e-6 * focal, K[..., 1, 0]),
+            (
+                "intrinsics must be invertible; the determinant of [:2, :2] is",
+                determinant.abs() > smallest,
+                determinant,
+            ),
             ("cam_from_world must have the last row (0, 0, 0, 1); its largest deviation is", last_e <= 1e-3, last_e),
             ("the rotation must be orthonormal (a scale in it?); max |R^T R - I| is", residual <= 1e-3, residual),
             ("the rotation must not mirror (is an axis flipped?); its determinant is", triple > 0, triple),

@@ -28,7 +28,7 @@ from lsmgeo._checks import (
 )
 from lsmgeo._linalg import homogeneous_row, transform
 from lsmgeo.cameras.camera_checks import check_cameras, rotation_error
-from lsmgeo.cameras.matrices import pinhole_matrix
+from lsmgeo.cameras.matrices import is_unskewed, pinhole_matrix
 from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, ShapeError
@@ -373,7 +373,7 @@ def to_pytorch3d(cameras: Cameras, *, in_ndc: bool = True) -> PyTorch3DCameras:
         `PyTorch3DCameras`; pass the image size (height, width) to PyTorch3D too.
 
     Raises:
-        CameraError: a camera with skew, which PyTorch3D does not support.
+        CameraError: a camera with skew or a rolled image, which PyTorch3D does not support.
 
     Example:
         >>> from lsmgeo.cameras import orbit, to_pytorch3d
@@ -384,8 +384,8 @@ def to_pytorch3d(cameras: Cameras, *, in_ndc: bool = True) -> PyTorch3DCameras:
     check_flag(who, "in_ndc", in_ndc)
     tensors = as_tensors(cameras, who)
     K, R, t = _split(who, tensors, "half")
-    if can_inspect(K) and bool((K[..., 0, 1].abs() > 1e-6 * K[..., 0, 0]).any()):
-        raise CameraError(f"{who}: cameras must have no skew, which PyTorch3D cannot hold")
+    if can_inspect(K) and not bool(is_unskewed(K).all()):
+        raise CameraError(f"{who}: cameras must have no skew and no rolled image, which PyTorch3D cannot hold")
     focal_length = K.diagonal(dim1=-2, dim2=-1)[..., :2]
     principal_point = K[..., :2, 2]
     if in_ndc:

@@ -10,7 +10,7 @@ from torch import Tensor
 from lsmgeo._linalg import basis_row, inverse_3x3, multiply, transform
 from lsmgeo.cameras.tensors import CameraTensors, image_sizes
 
-__all__ = ["CameraMatrices", "camera_matrices", "pinhole_matrix", "resize_matrix"]
+__all__ = ["CameraMatrices", "camera_matrices", "is_unskewed", "pinhole_matrix", "resize_matrix"]
 
 
 class CameraMatrices(NamedTuple):
@@ -65,6 +65,12 @@ def pinhole_matrix(fx: Tensor, fy: Tensor, cx: Tensor, cy: Tensor) -> Tensor:
     """K, (..., 3, 3), without skew, of focal lengths and principal points (...) of one shape."""
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
+
+
+def is_unskewed(K: Tensor) -> Tensor:
+    """Whether each K (..., 3, 3) is diagonal but for the principal point, (...) bool."""
+    shear = torch.maximum(K[..., 0, 1].abs(), K[..., 1, 0].abs())
+    return shear <= 1e-6 * torch.minimum(K[..., 0, 0].abs(), K[..., 1, 1].abs())
 
 
 def resize_matrix(

@@ -162,19 +162,19 @@ def default_depth_range(scene: PosedImages, view: int) -> tuple[float, float]:
     measured = measured_depth_range(scene, view)
     if measured is not None:
         return measured
-    K = scene.cameras.intrinsics[view].double().numpy()
+    fx, fy = torch.linalg.vector_norm(scene.cameras.intrinsics[view, :2, :2].double(), dim=-1).tolist()
     height, width = scene.size(view)
     middle = float(depth_of(scene, view, common_point(scene.cameras)[None])[0])
     origins = centers(scene.cameras).numpy()
     away = np.linalg.norm(origins - origins[view], axis=1)
     # If axes are parallel, their common point depends on rounding only.
     if middle > 1e-6 * away.max():
-        radius = 0.75 * middle * float(min(0.5 * width / K[0, 0], 0.5 * height / K[1, 1]))
+        radius = 0.75 * middle * float(min(0.5 * width / fx, 0.5 * height / fy))
         radius = min(radius, 0.5 * middle)
         return middle - radius, middle + radius
     if not away.any():
         raise OptionError(f"view {view}: the cameras look at no common point; give near and far")
-    moved = float(K[0, 0]) * float(away[away > 0].min()) / width
+    moved = fx * float(away[away > 0].min()) / width
     return moved / LARGEST_DISPARITY, moved / SMALLEST_DISPARITY
 
 

@@ -37,7 +37,7 @@ def test_distortion_is_said_to_be_gone(scene, tmp_path, capsys):
     ("arguments", "message"),
     [
         (["--to", "nerf"], "to must be one of"),
-        (["--to", "colmap"], "cameras must have no skew"),
+        (["--to", "colmap"], "no skew: COLMAP cannot hold"),
         (["--to", "cameras", "--out", "{source}"], "exists and is not an empty folder"),
         (["--to", "cameras", "--jobs", "2"], "splits and jobs are for shards"),
     ],

@@ -10,7 +10,7 @@ from PIL import Image
 
 from lsmgeo import data
 from lsmgeo.data.atomic_files import atomic_file, atomic_folder, is_abandoned
-from lsmgeo.errors import DataError, OptionError
+from lsmgeo.errors import CameraError, DataError, OptionError
 from tests.data.posed_writers import trimmed, write_plain_cameras, write_transforms
 from tests.data.writers import project, write_colmap
 
@@ -131,9 +131,7 @@ def test_skew_is_refused(scene, tmp_path, form):
         values["cameras"][1]["K"][0][1] = 0.75
 
     source = data.open(write_plain_cameras(scene, tmp_path / "source", change))
-    with pytest.raises(
-        OptionError, match=r"cameras must have no skew, which .* does not support; 'images/v1\.png' has 0\.75"
-    ):
+    with pytest.raises(CameraError, match=r"no skew: .* cannot hold 'images/v1\.png' with K.* 0\.75"):
         WRITERS[form](source, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     check(data.open(data.write_cameras_json(source, tmp_path / "out")), source)

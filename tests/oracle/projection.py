@@ -11,11 +11,11 @@ Array = npt.NDArray[np.float64]
 def project(intrinsics: Array, rotation_matrix: Array, translation: Array, points: Array) -> tuple[Array, Array]:
     """Pixels (N, 2) and depths (N,) of points (N, 3); pixels are NaN or inf where the depth is 0."""
     x, y, z = (points @ rotation_matrix.T + translation).T
-    fx, skew, cx = intrinsics[0]
-    _, fy, cy = intrinsics[1]
+    a, b, cx = intrinsics[0]
+    c, d, cy = intrinsics[1]
     with np.errstate(all="ignore"):
-        u = (fx * x + skew * y) / z + cx
-        v = fy * y / z + cy
+        u = (a * x + b * y) / z + cx
+        v = (c * x + d * y) / z + cy
     return np.stack([u, v], axis=-1), z
 
 
@@ -44,10 +44,9 @@ def resize_intrinsics(intrinsics: Array, image_size: tuple[int, int], size: tupl
     """Intrinsics of the same camera whose image (H, W) is resized to (h, w), area for area."""
     sy, sx = size[0] / image_size[0], size[1] / image_size[1]
     resized = np.array(intrinsics, dtype=np.float64)
-    resized[0, 0] *= sx
-    resized[0, 1] *= sx
+    resized[0, :2] *= sx
     resized[0, 2] = (intrinsics[0, 2] + 0.5) * sx - 0.5
-    resized[1, 1] *= sy
+    resized[1, :2] *= sy
     resized[1, 2] = (intrinsics[1, 2] + 0.5) * sy - 0.5
     return resized
 

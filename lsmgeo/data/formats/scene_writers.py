@@ -11,12 +11,13 @@ import numpy as np
 import torch
 
 from lsmgeo.cameras import to_colmap, to_opengl
+from lsmgeo.cameras.matrices import is_unskewed
 from lsmgeo.data.atomic_files import atomic_folder, write_atomic
 from lsmgeo.data.formats.format_cameras_json import NAME, camera_entry, encode_cameras
 from lsmgeo.data.formats.scene_assembly import check_image_size
 from lsmgeo.data.images import MAX_IMAGE_BYTES, SUFFIXES, encode_png, image_size, read_cut_out, read_image
 from lsmgeo.data.read_files import path_inside, read_bytes
-from lsmgeo.errors import DataError, OptionError
+from lsmgeo.errors import CameraError, DataError, OptionError
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -46,10 +47,10 @@ def write_colmap(images: PosedImages, folder: str | PathLike[str]) -> Path:
         The folder.
 
     Raises:
-        OptionError: a camera has skew, which COLMAP does not support.
+        CameraError: a camera has skew, or its image is flipped or rolled, which COLMAP does not support.
         DataError: the folder exists or cannot be written, or an image cannot be read.
     """
-    _refuse_skew("write_colmap", "COLMAP", images)
+    _require_upright("write_colmap", "COLMAP", images)
     names = _file_names(images, blank="_")
     K, quaternions, translations = (part.numpy() for part in to_colmap(_as_rigid(images.cameras)))
     models: dict[str, int] = {}
@@ -86,10 +87,10 @@ def write_transforms(images: PosedImages, folder: str | PathLike[str]) -> Path:
         The folder.
 
     Raises:
-        OptionError: a camera has skew, which the format does not support.
+        CameraError: a camera has skew, or its image is flipped or rolled, which the format does not support.
         DataError: the folder exists or cannot be written, or an image cannot be read.
     """
-    _refuse_skew("write_transforms", "transforms.json", images)
+    _require_upright("write_transforms", "transforms.json", images)
     names = _file_names(images)
     K, poses = (part.numpy() for part in to_opengl(_as_rigid(images.cameras)))
     stated, frames = [], []
@@ -128,9 +129,11 @@ def write_cameras_json(images: PosedImages, path: str | PathLike[str]) -> Path:
         The path.
 
     Raises:
+        CameraError: an image is flipped or rolled, which the reader does not accept.
         OptionError: only cameras are written, and an image is elsewhere or has distortion.
         DataError: the folder exists, a file cannot be written, or an image cannot be read.
     """
+    _require_upright("write_cameras_json", NAME, images, skew=True)
     path = Path(path)
     only_cameras = path.suffix.lower() == ".json"
     names = _below(images, path.parent) if only_cameras else [f"{IMAGES}/{name}" for name in _file_names(images)]
@@ -190,12 +193,16 @@ def _write_images(images: PosedImages, names: list[str], folder: Path) -> None:
         write_atomic(path_inside(folder, name, source), content)
 
 
-def _refuse_skew(who: str, what: str, images: PosedImages) -> None:
-    K = images.cameras.intrinsics
-    for view in (K[:, 0, 1].abs() > 1e-6 * K[:, 0, 0]).nonzero()[:1, 0].tolist():
-        skew = float(K[view, 0, 1])
-        raise OptionError(
-            f"{who}: cameras must have no skew, which {what} does not support; {images.names[view]!r} has {skew:g}"
+def _require_upright(who: str, what: str, images: PosedImages, skew: bool = False) -> None:
+    """Raise a CameraError for images that are flipped, rolled or, unless `skew`, skewed: `what` cannot hold them."""
+    K = images.cameras.intrinsics.clone()
+    if skew:
+        K[:, 0, 1] = 0.0
+    good = is_unskewed(K) & (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0)
+    for view in (~good).nonzero()[:1, 0].tolist():
+        raise CameraError(
+            f"{who}: cameras must have positive focal lengths and no {'rolled image' if skew else 'skew'}: {what} "
+            f"cannot hold {images.names[view]!r} with K[:2, :2] = {images.cameras.intrinsics[view, :2, :2].tolist()}"
         )
 
 

@@ -27,6 +27,7 @@ BENCHMARKS = {
     "operators_contiguous": "operators.contiguous",
     "footprint": "operators.footprint",
     "systems": "operators.systems",
+    "cost_volumes": "cost_volumes.measure",
     "growth": "operators.growth",
     "models": "models.steps",
     "imports": "models.imports",
@@ -39,7 +40,16 @@ BENCHMARKS = {
     "known_sets": "known_sets.figures",
     "planted_mistakes": "known_sets.mistakes",
 }
-USUAL = ("operators_channels_last", "operators_contiguous", "footprint", "systems", "growth", "models", "imports")
+USUAL = (
+    "operators_channels_last",
+    "operators_contiguous",
+    "footprint",
+    "systems",
+    "cost_volumes",
+    "growth",
+    "models",
+    "imports",
+)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -47,10 +47,10 @@ def ours(scene: Scene, backend: str = "auto", fused: bool = True) -> Run:
 
     def products(features: Tensor) -> Any:
         # At the frustum's own pixels no interpolation is needed.
-        first = features[:, :1, :, None, scene.window, scene.window]
+        first = features[:, 0, :, None, scene.window, scene.window]
         others = scene.cameras.at((slice(None), slice(1, None)))
-        volume, _ = functional.unproject(features[:, 1:], others, scene.grid, **options)
-        return (volume * first).mean(2), None
+        products = functional.unproject(features[:, 1:], others, scene.grid, reference=first, **options).volume
+        return products[:, :, 0], None
 
     def swept(volume: Tensor, flatten: bool = problem.flatten) -> Any:
         where = scene.cameras, scene.grid, scene.depths, size
@@ -88,20 +88,21 @@ def kernel(scene: Scene) -> dict[str, Callable[[], Any]]:
     if is_sweep:
         where = scene.cameras, scene.grid, scene.depths, (problem.size,) * 2
         sites = sweep_sites("benchmark", source, *where, None, options)
-        forward, backward, axis = library.plane_sweep_project, library.plane_sweep_project_backward, 1
+        forward, backward, given, axis = library.plane_sweep_project, library.plane_sweep_project_backward, (sites,), 1
     else:
         sites = image_sites("benchmark", source, scene.cameras, scene.grid, None, options)
-        forward, backward, axis = library.unproject, library.unproject_backward, 2
-    out, _ = forward(source, sites, options)
+        forward, backward, given, axis = library.unproject, library.unproject_backward, (sites, None), 2
+    needs = (True, *(False,) * (2 + len(given)))
+    out, _ = forward(source, *given, options)
     gradient = scene.cotangent(out)
     into = channels_last(torch.zeros(source.shape), axis)
 
     def both() -> tuple[Tensor, Tensor]:
-        forward(source, sites, options, out=out)
+        forward(source, *given, options, out=out)
         into.zero_()  # the kernel accumulates
-        return out, backward(gradient, source, sites, options, (True, False, False, False), into=into)[0]
+        return out, backward(gradient, source, *given, options, needs, into=into)[0]
 
-    return {"forward": lambda: forward(source, sites, options, out=out)[0], "forward+backward": both}
+    return {"forward": lambda: forward(source, *given, options, out=out)[0], "forward+backward": both}
 
 
 def floors(count: int) -> dict[str, Callable[[], Any]]:

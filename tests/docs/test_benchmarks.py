@@ -92,6 +92,7 @@ def test_a_model_that_differs_on_hand_written_operators_is_not_timed(name):
         ("operators_contiguous", ["Unproject, variance, forward", "kernel, warm memory", "floor, fresh memory"]),
         ("footprint", ["Sweep and 1x1 map, 32 x 64 to 512, forward", "time grows as voxels to the power, forward"]),
         ("systems", ["Frustum, variance, forward", "kornia DepthWarper", "running mean (Atlas)"]),
+        ("cost_volumes", ["4 warped volumes, forward", "repeat and warp : correlation", "through points"]),
         ("gpu", ["Sweep, 128^3, nearest, forward+backward", "share of the copy's bandwidth"]),
         ("scenes", ["10 solids, 64 x 64, 1 x 20 views, shadows"]),
         ("render_set", ["lsmgeo render, 4 shapes of 2 views at 64 x 64 with depth and voxels"]),

@@ -1,0 +1,61 @@
+"""Cost volumes of the field in a few lines each; ``docs/recipes.rst`` shows them, and tests hold them to the formulas.
+
+Everywhere: features (B, V, C, h, w) and cameras (B, V), the reference view first.
+"""
+
+import torch
+from torch import Tensor
+
+from lsmgeo import FrustumGrid, Unproject
+from lsmgeo.cameras import CameraTensors, centers
+
+
+def mvsnet_variance(features: Tensor, cameras: CameraTensors, depths: Tensor) -> tuple[Tensor, Tensor]:
+    """MVSNet: the variance over all views, and where it says something: at least two views see the site."""
+    frustum = FrustumGrid(cameras.at((slice(None), 0)), depths, size=tuple(features.shape[-2:]))
+    volume, visible = Unproject(frustum, reduce="variance")(features, cameras)
+    return volume, visible.sum(1) >= 2
+
+
+def casmvsnet_stage(
+    features: Tensor, cameras: CameraTensors, depth: Tensor, interval: float, planes: int
+) -> tuple[Tensor, Tensor]:
+    """A CasMVSNet stage: hypotheses (B, P, h, w) around a coarse depth map (B, h, w), and their variance."""
+    offsets = interval * (torch.arange(planes, dtype=depth.dtype) - planes // 2)
+    hypotheses = (depth[:, None] + offsets[:, None, None]).clamp_min(1e-3)
+    volume, _ = Unproject(FrustumGrid(cameras.at((slice(None), 0)), hypotheses), reduce="variance")(features, cameras)
+    return hypotheses, volume
+
+
+def patchmatchnet_step(
+    features: Tensor, cameras: CameraTensors, depth: Tensor, weights: Tensor, groups: int
+) -> tuple[Tensor, Tensor]:
+    """A PatchmatchNet step: each pixel tries its own depth (B, h, w) and its neighbours', in no order.
+
+    `weights` (B, V - 1, h, w) say how much each source view counts.
+    """
+    hypotheses = torch.stack([depth.roll(shift, axis) for shift, axis in ((0, 1), (1, 1), (-1, 1), (1, 2), (-1, 2))], 1)
+    frustum, sources = FrustumGrid(cameras.at((slice(None), 0)), hypotheses), cameras.at((slice(None), slice(1, None)))
+    match, _ = Unproject(frustum, groups=groups)(features[:, 1:], sources, reference=features[:, 0, :, None])
+    share = (weights / weights.sum(1, keepdim=True))[:, :, None, None]
+    return hypotheses, (match * share).sum(1)  # (B, groups, P, h, w)
+
+
+def groupwise_correlation(features: Tensor, cameras: CameraTensors, depths: Tensor, groups: int) -> Tensor:
+    """Group-wise correlation, the mean over the source views that see the site."""
+    frustum = FrustumGrid(cameras.at((slice(None), 0)), depths, size=tuple(features.shape[-2:]))
+    match = Unproject(frustum, groups=groups, reduce="mean")
+    sources = cameras.at((slice(None), slice(1, None)))
+    return match(features[:, 1:], sources, reference=features[:, 0, :, None]).volume
+
+
+def simplerecon_volume(features: Tensor, cameras: CameraTensors, depths: Tensor) -> Tensor:
+    """SimpleRecon: a dot product for each source view and its metadata, (B, V - 1, 7, P, h, w), for an MLP."""
+    own, sources = cameras.at((slice(None), slice(1))), cameras.at((slice(None), slice(1, None)))
+    frustum = FrustumGrid(own.at((slice(None), 0)), depths, size=tuple(features.shape[-2:]))
+    unproject = Unproject(frustum, augment=("depth", "direction"))
+    values, visible = unproject(features[:, 1:], sources, reference=features[:, 0, :, None])
+    ray = unproject(features[:, :1, :0], own).volume[:, :, 1:]  # the reference's own direction
+    angle = (ray * values[:, :, 2:]).sum(2, keepdim=True).clamp(-1, 1).acos()
+    baseline = (centers(sources) - centers(own)).norm(dim=-1)[:, :, None, None, None, None]
+    return torch.cat((values, angle, visible[:, :, None], baseline.expand_as(angle)), 2)

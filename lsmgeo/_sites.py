@@ -12,11 +12,11 @@ from torch import Tensor
 
 from lsmgeo._checks import check_devices, check_float, describe
 from lsmgeo._linalg import affine_inverse, multiply
-from lsmgeo.cameras.camera_checks import check_views, image_size, views_per_scene
+from lsmgeo.cameras.camera_checks import check_views, views_per_scene
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
 from lsmgeo.cameras.tensors import Cameras, as_tensors, leading_shape
-from lsmgeo.errors import DTypeError, ShapeError
-from lsmgeo.grids import FrustumGrid, Lattice, VoxelGrid, check_depths
+from lsmgeo.errors import DTypeError, OptionError, ShapeError
+from lsmgeo.grids import DEPTHS, FrustumGrid, Lattice, VoxelGrid, check_depths, map_size
 from lsmgeo.kernels.request import Options, Sites
 
 __all__ = ["Cameras", "Grid", "check_features", "direction_matrix", "image_matrices", "image_sites", "sweep_sites"]
@@ -54,7 +54,7 @@ def _lattice(who: str, grid: Grid, source: Tensor) -> Lattice:
         return grid.lattice()
     lattice = grid.lattice(source.device)
     T, z = lattice.world_from_lattice, lattice.z
-    for scenes in (*T.shape[:-2], *z.shape[:-1]):
+    for scenes in (*T.shape[:-2], *z.shape[:-1][:1]):
         if scenes != source.shape[0]:
             raise ShapeError(
                 f"{who}: grid must have one pose and one row of depths, or as many as scenes, B = {source.shape[0]}; "
@@ -78,14 +78,38 @@ def image_sites(
     grid: Grid,
     view_mask: Tensor | None,
     options: Options,
+    reference: Tensor | None = None,
 ) -> Sites:
     """The checked sites of a grid in the views' images."""
     lattice = _lattice(who, grid, features)
     matrices = image_matrices(who, features, cameras, view_mask)
+    _check_reference(who, reference, features, grid, options)
     T, x, y, z, projective = lattice
     T = T if T.dim() == 2 else T[:, None]  # (B, 1, 4, 4): shared by the views
     direction = direction_matrix(matrices, T, options.direction) if options.direction else None
     return Sites(multiply(matrices.projection(), T), direction, x, y, z, projective, view_mask)
+
+
+def _check_reference(who: str, reference: Tensor | None, features: Tensor, grid: Grid, options: Options) -> None:
+    groups, channels = options.groups, features.shape[2]
+    if reference is None:
+        if groups > 1:
+            raise OptionError(f"{who}: groups must be 1 without a reference; got {groups}")
+        return
+    expected = "(B, C, D or 1, H, W)"
+    check_float(who, "reference", reference, expected, rank=5)
+    if reference.dtype != features.dtype:
+        raise DTypeError(f"{who}: reference must be of the features' {features.dtype}; got {reference.dtype}")
+    check_devices(who, features=features, reference=reference)
+    depth, height, width = grid.shape  # type: ignore[misc]
+    shape = (features.shape[0], channels, reference.shape[2], height, width)
+    if tuple(reference.shape) != shape or reference.shape[2] not in (1, depth):
+        raise ShapeError(
+            f"{who}: reference must be {expected} with (B, C) = {(features.shape[0], channels)} and the grid's "
+            f"(D, H, W) = {grid.shape}; got {tuple(reference.shape)}"
+        )
+    if channels % groups:
+        raise OptionError(f"{who}: groups must divide the C = {channels} channels; got {groups}")
 
 
 def sweep_sites(
@@ -97,8 +121,9 @@ def sweep_sites(
     size: tuple[int, int] | None,
     view_mask: Tensor | None,
     options: Options,
+    per_pixel: bool = True,
 ) -> Sites:
-    """The checked sites of the views' frustums in a volume."""
+    """The checked sites of the views' frustums in a volume; depths may be those of each pixel if `per_pixel`."""
     check_float(who, "volume", volume, "(B, C, D, H, W)", rank=5)
     if not isinstance(grid, VoxelGrid):
         raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
@@ -110,19 +135,20 @@ def sweep_sites(
     views = views_per_scene(who, tensors, volume.shape[0], "volume's")
     lattice = _lattice(who, grid, volume)
     tensors = check_views(who, tensors, views, view_mask, volume=volume)
-    check_depths(who, depths, "(P,), (B, P) or (B, V, P)", view_mask)
-    if depths.dim() > 1 and tuple(depths.shape[:-1]) != views[: depths.dim() - 1]:
+    check_depths(who, depths, (1, 2, 3, 5) if per_pixel else (1, 2, 3), view_mask)
+    if depths.dim() > 1 and tuple(depths.shape[: min(depths.dim() - 1, 2)]) != views[: depths.dim() - 1]:
         raise ShapeError(
-            f"{who}: depths must be (P,), (B, P) or (B, V, P) with (B, V) = {views}; got {tuple(depths.shape)}"
+            f"{who}: depths must be {DEPTHS[depths.dim()]} with (B, V) = {views}; got {tuple(depths.shape)}"
         )
     check_devices(who, volume=volume, depths=depths)
-    size = image_size(who, tensors, size)
+    size = map_size(who, tensors, depths, size)
     matrices = camera_matrices(tensors, size, view_mask)
     frustum = matrices.world_from_frustum()
     inverse = affine_inverse(lattice.world_from_lattice)[..., :3, :]
     matrix = multiply(inverse if inverse.dim() == 2 else inverse[:, None], frustum)
     direction = direction_matrix(matrices, frustum, options.direction) if options.direction else None
     x, y = (torch.arange(n, dtype=torch.float64, device=volume.device) for n in (size[1], size[0]))
-    if view_mask is not None and depths.dim() == 3:
-        depths = torch.where(view_mask[..., None], depths, 1.0)
-    return Sites(matrix, direction, x, y, 1.0 / depths.double(), True, view_mask)
+    if view_mask is not None and depths.dim() > 2:  # those of masked views are not read
+        depths = torch.where(view_mask.reshape(*views, *(1,) * (depths.dim() - 2)), depths, 1.0)
+    z = depths if depths.dim() == 5 else 1.0 / depths.double()
+    return Sites(matrix, direction, x, y, z, True, view_mask)

@@ -14,14 +14,7 @@ import torch
 from torch import Tensor
 
 from lsmgeo import kernels
-from lsmgeo._checks import (
-    check_choices,
-    check_devices,
-    check_float,
-    check_geometry,
-    check_mask,
-    check_whole,
-)
+from lsmgeo._checks import check_choices, check_devices, check_float, check_geometry, check_mask, check_whole
 from lsmgeo._dtypes import computing_dtype, saturating_cast
 from lsmgeo._sites import Cameras, Grid, check_features, direction_matrix, image_matrices, image_sites, sweep_sites
 from lsmgeo.debugging import can_inspect
@@ -70,6 +63,9 @@ def unproject(
     direction_frame: str = "world",
     reduce: Names | None = None,
     near: float = 1e-6,
+    reference: Tensor | None = None,
+    groups: int = 1,
+    memory_format: torch.memory_format | None = None,
     backend: str = "auto",
 ) -> Unprojected:
     """Lift image features to the sites of a grid: each site takes the feature where its ray meets the image.
@@ -95,12 +91,17 @@ def unproject(
         reduce: None, or "mean", "variance", "max" or several: statistics over the views that see a site, 0 where none
             does, without holding the volumes of all views.
         near: least depth of a visible site, world units.
+        reference: (B, C, D or 1, H, W), of the features' dtype: answer with its correlation with the samples instead of
+            these. At sites that are not in front it is not read, and the answer is 0.
+        groups: of channels, that are correlated each: of C channels the answer has this many, the means over C / groups
+            channels of reference times sample (group-wise correlation, Guo et al., 2019); 1 is the dot product over C.
+        memory_format: ``torch.contiguous_format`` for a contiguous answer; by default its strides are what is fastest.
         backend: "auto", or the name of one (see `lsmgeo.kernels.explain`).
 
     Returns:
-        ``volume`` (B, V, C', D, H, W), or (B, C'', D, H, W) with `reduce`; C' is C plus 1 for depth plus 3 for
-        direction, C'' is C' for each statistic in the order requested; and ``visible`` (B, V, D, H, W) bool.
-        Differentiable in features, K, R, t, the grid's pose, its camera and its depths.
+        ``volume`` (B, V, C', D, H, W), or (B, C'', D, H, W) with `reduce`; C' is C (with a reference: `groups`) plus 1
+        for depth plus 3 for direction, C'' is C' for each statistic in the order requested; and ``visible``
+        (B, V, D, H, W) bool. Differentiable in features, reference, K, R, t, the grid's pose, its camera and depths.
 
     Raises:
         ShapeError, DTypeError, DeviceError, CameraError, GridError, OptionError: see `lsmgeo.errors`.
@@ -116,18 +117,17 @@ def unproject(
         tensor([2.3889, 2.6429])
     """
     who = "Unproject"
-    options = kernels.check_options(
-        who, "bilinear", backend, mode, padding_mode, augment, direction_frame, reduce, near
-    )
-    return run_unproject(features, cameras, grid, view_mask, options)
+    choices = mode, padding_mode, augment, direction_frame, reduce, near
+    options = kernels.check_options(who, "bilinear", backend, *choices, groups=groups, memory_format=memory_format)
+    return run_unproject(features, cameras, grid, view_mask, reference, options)
 
 
 def run_unproject(
-    features: Tensor, cameras: Cameras, grid: Grid, view_mask: Tensor | None, options: Options
+    features: Tensor, cameras: Cameras, grid: Grid, view_mask: Tensor | None, reference: Tensor | None, options: Options
 ) -> Unprojected:
     """`unproject` with options that are checked already."""
-    sites = image_sites("Unproject", features, cameras, grid, view_mask, options)
-    return Unprojected(*kernels.run("unproject", features, sites, options=options))
+    sites = image_sites("Unproject", features, cameras, grid, view_mask, options, reference)
+    return Unprojected(*kernels.run("unproject", features, sites, reference, options=options))
 
 
 def unproject_slabs(
@@ -143,6 +143,9 @@ def unproject_slabs(
     direction_frame: str = "world",
     reduce: Names | None = None,
     near: float = 1e-6,
+    reference: Tensor | None = None,
+    groups: int = 1,
+    memory_format: torch.memory_format | None = None,
     backend: str = "auto",
 ) -> Iterator[tuple[int, Tensor, Tensor]]:
     """`unproject` for grids too large for memory: slab by slab along the grid's first axis.
@@ -159,6 +162,9 @@ def unproject_slabs(
         direction_frame: see `unproject`.
         reduce: see `unproject`.
         near: see `unproject`.
+        reference: see `unproject`; (B, C, D or 1, H, W) for the whole grid.
+        groups: see `unproject`.
+        memory_format: see `unproject`.
         backend: see `unproject`.
 
     Yields:
@@ -178,15 +184,17 @@ def unproject_slabs(
     """
     who = "unproject_slabs"
     check_whole(who, "planes", planes, 1)
-    options = kernels.check_options(
-        who, "bilinear", backend, mode, padding_mode, augment, direction_frame, reduce, near
-    )
-    sites = image_sites(who, features, cameras, grid, view_mask, options)
+    choices = mode, padding_mode, augment, direction_frame, reduce, near
+    options = kernels.check_options(who, "bilinear", backend, *choices, groups=groups, memory_format=memory_format)
+    sites = image_sites(who, features, cameras, grid, view_mask, options, reference)
 
     def slabs() -> Iterator[tuple[int, Tensor, Tensor]]:
-        for start in range(0, sites.z.shape[-1], planes):
+        for start in range(0, sites.counts()[0], planes):
             part = sites.slab(start, start + planes)
-            yield start, *kernels.run("unproject", features, part, options=options)
+            other = (
+                reference if reference is None or reference.shape[2] == 1 else reference[:, :, start : start + planes]
+            )
+            yield start, *kernels.run("unproject", features, part, other, options=options)
 
     return slabs()
 
@@ -331,6 +339,7 @@ def plane_sweep_project(
     direction_frame: str = "world",
     flatten: bool = True,
     near: float = 1e-6,
+    memory_format: torch.memory_format | None = None,
     backend: str = "auto",
 ) -> Projected:
     """Read a volume along the rays of cameras, at planes of constant depth.
@@ -346,8 +355,10 @@ def plane_sweep_project(
         volume: (B, C, D, H, W), float16, bfloat16, float32 or float64.
         cameras: B*V cameras, view fastest: a kornia ``PinholeCamera`` or ``PinholeCamerasList``, or `CameraTensors`.
         grid: the `VoxelGrid` on which the volume lives.
-        depths: (P,), (B, P) or (B, V, P) camera z in world units, positive, strictly ascending, float32 or float64.
-        size: (h, w) of the maps; by default the cameras' image size, which all must then share.
+        depths: (P,), (B, P) or (B, V, P) camera z in world units, positive, strictly ascending, float32 or float64; or,
+            for each pixel, (B, V, P, h, w), positive and finite, in any order.
+        size: (h, w) of the maps; by default the cameras' image size, which all must then share, or that
+            of depths of each pixel.
         view_mask: (B, V) bool; views where it is False give zeros and are unread.
         mode: "trilinear", or "nearest": the voxel that contains the sample.
         padding_mode: "zeros" or "border".
@@ -355,6 +366,7 @@ def plane_sweep_project(
         direction_frame: "world" or "camera".
         flatten: whether channels and planes share an axis, index ``c * P + k``.
         near: least depth of a visible plane, world units.
+        memory_format: ``torch.contiguous_format`` for contiguous maps; by default their strides are what is fastest.
         backend: "auto", or the name of one.
 
     Returns:
@@ -376,7 +388,9 @@ def plane_sweep_project(
         tensor([ 0.2500,  0.0000, -0.2500])
     """
     choices = mode, padding_mode, augment, direction_frame
-    options = kernels.check_options("PlaneSweepProject", "trilinear", backend, *choices, near=near, flatten=flatten)
+    options = kernels.check_options(
+        "PlaneSweepProject", "trilinear", backend, *choices, near=near, flatten=flatten, memory_format=memory_format
+    )
     return run_plane_sweep_project(volume, cameras, grid, depths, size, view_mask, options)
 
 

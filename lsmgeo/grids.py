@@ -29,7 +29,7 @@ from lsmgeo._linalg import affine_inverse, basis_row, homogeneous_row, inverse_3
 from lsmgeo._torch_compat import is_exporting
 from lsmgeo.cameras.camera_checks import check_cameras, image_size
 from lsmgeo.cameras.matrices import camera_matrices
-from lsmgeo.cameras.tensors import Cameras, as_tensors, leading_shape
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, leading_shape
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import DTypeError, GridError, ShapeError
 
@@ -42,7 +42,10 @@ LARGEST_NUMBER_OF_PLANES = 2**20
 
 
 class Lattice(NamedTuple):
-    """A lattice in float64: T (4, 4) or (B, 4, 4); x (W,), y (H,), z (D,) or (B, D); whether T is projective."""
+    """A lattice in float64: T (4, 4) or (B, 4, 4); x (W,), y (H,), z (D,) or (B, D); whether T is projective.
+
+    Where depths differ from pixel to pixel, z (B, 1, D, H, W) holds them, in their dtype.
+    """
 
     world_from_lattice: Tensor
     x: Tensor
@@ -54,6 +57,8 @@ class Lattice(NamedTuple):
         """World positions of the sites, (D, H, W, 3) or (B, D, H, W, 3)."""
         T, x, y, z, projective = self
         plane = T[..., :3, 0, None, None] * x + (T[..., :3, 1, None, None] * y[:, None] + T[..., :3, 3, None, None])
+        if z.dim() == 5:
+            return (plane[..., None, :, :] * z + T[..., :3, 2, None, None, None]).movedim(-4, -1)
         line = T[..., :3, 2, None] * z[..., None, :]  # (B?, 3, D)
         points = plane[..., None, :, :] + line[..., None, None]
         if projective:
@@ -185,12 +190,26 @@ def _bounds(name: str, value: object) -> tuple[float, float, float]:
     return x, y, z
 
 
-def check_depths(who: str, depths: Tensor, expected: str = "(P,) or (B, P)", view_mask: Tensor | None = None) -> None:
-    """Require float32 or float64 depths, at least one, positive and strictly ascending along the last axis."""
+DEPTHS = {1: "(P,)", 2: "(B, P)", 3: "(B, V, P)", 4: "(B, P, h, w)", 5: "(B, V, P, h, w)"}  # by number of axes
+
+
+def planes_of(depths: Tensor) -> int:
+    """P of depths as in `DEPTHS`."""
+    return depths.shape[-1 if depths.dim() < 4 else -3]
+
+
+def check_depths(who: str, depths: Tensor, axes: Sequence[int], view_mask: Tensor | None = None) -> None:
+    """Require float32 or float64 depths with one of these numbers of axes, at least one plane.
+
+    Rows shared by all pixels must be positive, finite and strictly ascending, where values may be read. Depths of each
+    pixel are checked by the kernel that reads them.
+    """
+    *others, last = (DEPTHS[number] for number in axes)
+    expected = f"{', '.join(others)} or {last}"
     check_geometry(who, "depths", depths, expected)
-    if depths.dim() < 1 or depths.dim() > expected.count("(") or depths.shape[-1] < 1:
+    if depths.dim() not in axes or planes_of(depths) < 1:
         raise ShapeError(f"{who}: depths must be {expected} with P at least 1; got {tuple(depths.shape)}")
-    if not can_inspect(depths):
+    if depths.dim() > 3 or not can_inspect(depths):
         return
     with torch.no_grad():
         good = (depths > 0).all(-1) & depths.isfinite().all(-1) & (depths.diff(dim=-1) > 0).all(-1)
@@ -204,11 +223,21 @@ def check_depths(who: str, depths: Tensor, expected: str = "(P,) or (B, P)", vie
             )
 
 
-def check_constant_depths(who: str, depths: Tensor) -> None:
+def map_size(who: str, cameras: CameraTensors, depths: Tensor, size: tuple[int, int] | None) -> tuple[int, int]:
+    """The (h, w) of maps: `size`, where depths are those of each pixel theirs, or the size of all cameras' images."""
+    if depths.dim() < 4:
+        return image_size(who, cameras, size)
+    height, width = depths.shape[-2:]
+    if size is not None and check_size(who, "size", size, 2, "(h, w)") != (height, width):
+        raise ShapeError(f"{who}: size must be that of the depths of each pixel, {(height, width)}; got {size}")
+    return height, width
+
+
+def check_constant_depths(who: str, depths: Tensor, axes: Sequence[int] = (1, 2, 3)) -> None:
     """Require depths that a module may store: not a parameter, which would become part of its state."""
     if isinstance(depths, torch.nn.Parameter):
         raise DTypeError(f"{who}: depths must be a plain tensor; got a Parameter (pass learned depths to the function)")
-    check_depths(who, depths, "(P,), (B, P) or (B, V, P)")
+    check_depths(who, depths, axes)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -220,8 +249,10 @@ class FrustumGrid:
 
     Args:
         camera: one camera per scene, leading shape () or (B,): a kornia ``PinholeCamera`` or `CameraTensors`.
-        depths: (P,) or (B, P) camera z in world units, positive, strictly ascending; see `depth_planes`.
-        size: (h, w) of the planes, for which K is resized; by default the camera's image size.
+        depths: (P,) or (B, P) camera z in world units, positive, strictly ascending; see `depth_planes`. Or, for each
+            pixel, (B, P, h, w), positive and finite, in any order: checked by the operator that reads them.
+        size: (h, w) of the planes, for which K is resized; by default the camera's image size, or that of depths of
+            each pixel.
 
     Gradients flow to the camera and to the depths.
 
@@ -253,14 +284,15 @@ class FrustumGrid:
                 f"{who}: camera must have leading shape () or (B,), one per scene, see cameras.select; got {leading}"
             )
         check_cameras(who, camera)
-        check_depths(who, self.depths)
-        if leading and self.depths.dim() == 2 and self.depths.shape[0] != leading[0]:
+        depths = self.depths
+        check_depths(who, depths, (1, 2, 4))
+        if leading and depths.dim() > 1 and depths.shape[0] != leading[0]:
             raise ShapeError(
-                f"{who}: depths must be (P,) or (B, P) with B = {leading[0]} cameras; got {tuple(self.depths.shape)}"
+                f"{who}: depths must be {DEPTHS[depths.dim()]} with B = {leading[0]} cameras; got {tuple(depths.shape)}"
             )
-        check_devices(who, camera=camera.intrinsics, depths=self.depths)
-        size = image_size(who, camera, self.size)
-        check_size(who, "shape", (self.depths.shape[-1], *size), 3, "(P, h, w)", GridError)
+        check_devices(who, camera=camera.intrinsics, depths=depths)
+        size = map_size(who, camera, depths, self.size)
+        check_size(who, "shape", (planes_of(depths), *size), 3, "(P, h, w)", GridError)
         object.__setattr__(self, "camera", camera)
         object.__setattr__(self, "size", size)
 
@@ -273,7 +305,7 @@ class FrustumGrid:
     def shape(self) -> tuple[int, int, int]:
         """(P, h, w)."""
         assert self.size is not None
-        return (self.depths.shape[-1], *self.size)
+        return (planes_of(self.depths), *self.size)
 
     @property
     def world_from_lattice(self) -> Tensor:
@@ -293,7 +325,8 @@ class FrustumGrid:
         T = T if device is None else moved("FrustumGrid", "camera", T, device)
         _, height, width = self.shape
         x, y = (torch.arange(n, dtype=T.dtype, device=T.device) for n in (width, height))
-        return Lattice(T, x, y, 1.0 / moved("FrustumGrid", "depths", self.depths, T.device).double(), True)
+        depths = moved("FrustumGrid", "depths", self.depths, T.device)
+        return Lattice(T, x, y, depths[:, None] if depths.dim() == 4 else 1.0 / depths.double(), True)
 
     def centers(self) -> Tensor:
         """Site positions in the world, (P, h, w, 3) or (B, P, h, w, 3) as x, y, z, of the depths' dtype."""

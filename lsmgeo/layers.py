@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from lsmgeo import functional, kernels
@@ -34,6 +35,7 @@ class SamplingLayer(nn.Module):
     augment = _as_given("augment")
     direction_frame = _as_given("direction_frame")
     near = _as_given("near")
+    memory_format = _as_given("memory_format")
     backend = _as_given("backend")
 
     def __init__(self, who: str, smooth: str, **given: Any) -> None:
@@ -61,10 +63,13 @@ class Unproject(SamplingLayer):
         direction_frame: "world" or "camera".
         reduce: None, or "mean", "variance", "max" or several: statistics over the views that see a site.
         near: least depth of a visible site, world units.
+        groups: of channels, that are correlated with the reference of a call.
+        memory_format: ``torch.contiguous_format`` for a contiguous volume; by default its strides are what is fastest.
         backend: "auto", or the name of one.
 
     Shape:
         - features: (B, V, C, h, w); cameras: B*V, view fastest; view_mask: (B, V) bool.
+        - reference: (B, C, D or 1, H, W).
         - volume: (B, V, C', D, H, W), or (B, C'', D, H, W) with `reduce`; visible: (B, V, D, H, W) bool.
 
     Raises:
@@ -82,6 +87,7 @@ class Unproject(SamplingLayer):
     """
 
     reduce = _as_given("reduce")
+    groups = _as_given("groups")
 
     def __init__(
         self,
@@ -93,6 +99,8 @@ class Unproject(SamplingLayer):
         direction_frame: str = "world",
         reduce: Names | None = None,
         near: float = 1e-6,
+        groups: int = 1,
+        memory_format: torch.memory_format | None = None,
         backend: str = "auto",
     ) -> None:
         if grid is not None and not isinstance(grid, (VoxelGrid, FrustumGrid)):
@@ -106,18 +114,26 @@ class Unproject(SamplingLayer):
             direction_frame=direction_frame,
             reduce=reduce,
             near=near,
+            groups=groups,
+            memory_format=memory_format,
             backend=backend,
         )
         self.grid = grid
 
     def forward(
-        self, features: Tensor, cameras: Cameras, view_mask: Tensor | None = None, *, grid: Grid | None = None
+        self,
+        features: Tensor,
+        cameras: Cameras,
+        view_mask: Tensor | None = None,
+        *,
+        grid: Grid | None = None,
+        reference: Tensor | None = None,
     ) -> Unprojected:
-        """Unproject features (B, V, C, h, w); `grid` takes precedence over the layer's."""
+        """Unproject features (B, V, C, h, w), or correlate them; `grid` takes precedence over the layer's."""
         grid = self.grid if grid is None else grid
         if grid is None:
             raise GridError("Unproject: grid must be given to the layer or to the call; got None")
-        return functional.run_unproject(features, cameras, grid, view_mask, self.options)
+        return functional.run_unproject(features, cameras, grid, view_mask, reference, self.options)
 
     def extra_repr(self) -> str:
         """The arguments."""
@@ -129,8 +145,8 @@ class PlaneSweepProject(SamplingLayer):
 
     Args:
         grid: the `VoxelGrid` on which the volumes live; None if it is passed to every call.
-        depths: (P,), (B, P) or (B, V, P), see `lsmgeo.depth_planes`; None if passed to every call. Neither is part
-            of the ``state_dict``; both follow the volume's device.
+        depths: (P,), (B, P), (B, V, P) or, for each pixel, (B, V, P, h, w), see `lsmgeo.depth_planes`; None if passed
+            to every call. Neither is part of the ``state_dict``; both follow the volume's device.
         size: (h, w) of the maps; by default the cameras' image size.
         mode: "trilinear" or "nearest".
         padding_mode: "zeros" or "border".
@@ -138,6 +154,7 @@ class PlaneSweepProject(SamplingLayer):
         direction_frame: "world" or "camera".
         flatten: whether channels and planes share an axis, index ``c * P + k``.
         near: least depth of a visible plane, world units.
+        memory_format: ``torch.contiguous_format`` for contiguous maps; by default their strides are what is fastest.
         backend: "auto", or the name of one.
 
     Shape:
@@ -172,13 +189,14 @@ class PlaneSweepProject(SamplingLayer):
         direction_frame: str = "world",
         flatten: bool = True,
         near: float = 1e-6,
+        memory_format: torch.memory_format | None = None,
         backend: str = "auto",
     ) -> None:
         who = "PlaneSweepProject"
         if grid is not None and not isinstance(grid, VoxelGrid):
             raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
         if depths is not None:
-            check_constant_depths(who, depths)
+            check_constant_depths(who, depths, (1, 2, 3, 5))
         if size is not None:
             check_size(who, "size", size, 2, "(h, w)")
         super().__init__(
@@ -190,6 +208,7 @@ class PlaneSweepProject(SamplingLayer):
             direction_frame=direction_frame,
             flatten=flatten,
             near=near,
+            memory_format=memory_format,
             backend=backend,
         )
         self.grid = grid

@@ -271,7 +271,7 @@ def _project_reduce(
 ) -> Projected:
     """`project_reduce` with options that are checked already."""
     who = "project_reduce"
-    sites = sweep_sites(who, volume, cameras, grid, depths, size, view_mask, options)
+    sites = sweep_sites(who, volume, cameras, grid, depths, size, view_mask, options, per_pixel=False)
     check_float(who, "weight", weight, "(O, C' P)")
     if weight.dim() == 4 and tuple(weight.shape[2:]) == (1, 1):
         weight = weight.flatten(1)

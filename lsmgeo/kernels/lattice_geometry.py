@@ -20,14 +20,35 @@ LARGEST_COORDINATE = 2.0**100
 SMALLEST_DEPTH = 2.0**-60
 
 
+def site_coordinates(sites: Sites, matrix: Tensor, dtype: torch.dtype) -> tuple[Tensor | None, Tensor]:
+    """The last two coordinates of q, w and z, both of (B, V, D, H, W) where they differ from site to site.
+
+    Homogeneous: with the depth d of a site, ``q = (w x, w y, z, w)``, ``w = min(d, 1)`` and ``z = w / d``, so that
+    nothing overflows, whatever the depth is. Otherwise w is None, for 1, and z is (B, V, D).
+    """
+    if not sites.per_site:
+        return None, per_view(sites.z, matrix).to(dtype)
+    depth = site_depths(sites, dtype)
+    is_close = depth < 1.0
+    return torch.where(is_close, depth, 1.0), torch.where(is_close, 1.0, depth).reciprocal()
+
+
+def site_depths(sites: Sites, dtype: torch.dtype) -> Tensor:
+    """The depths of sites that each have their own, (B, V, D, H, W)."""
+    return sites.z.to(dtype).expand(*sites.matrix.shape[:2], *sites.z.shape[2:])
+
+
 def lattice_rows(matrix: Tensor, sites: Sites, dtype: torch.dtype) -> list[Tensor]:
     """The three coordinates of ``M q``, each (B, V, D, H, W).
 
     A lattice is separable: the terms in x and y make a plane, those in z a line, and the full array is their sum.
     """
     m = matrix.to(dtype)
-    line = m[..., 2, None] * per_view(sites.z, matrix).to(dtype)[:, :, None]  # (B, V, 3, D)
     plane = plane_rows(m, sites)  # (B, V, 3, H, W)
+    w, z = site_coordinates(sites, matrix, dtype)
+    if w is not None:
+        return [plane[:, :, row, None] * w + m[:, :, row, 2, None, None, None] * z for row in range(3)]
+    line = m[..., 2, None] * z[:, :, None]  # (B, V, 3, D)
     return [plane[:, :, row, None] + line[:, :, row, :, None, None] for row in range(3)]
 
 
@@ -62,7 +83,10 @@ def _extent(matrix: Tensor, reach: Sequence[Tensor]) -> Tensor:
 
 def lattice_extent(matrix: Tensor, sites: Sites) -> Tensor:
     """A bound on the terms of ``M q`` over a lattice, (B, V)."""
-    z = per_view(sites.z.detach(), matrix).abs().amax(-1)
+    if sites.per_site:  # homogeneous: |z| <= 1, see `site_coordinates`
+        z = torch.ones(matrix.shape[:2], dtype=torch.float64, device=matrix.device)
+    else:
+        z = per_view(sites.z.detach(), matrix).abs().amax(-1)
     return _extent(matrix, (sites.x.abs().amax(0), sites.y.abs().amax(0), z))
 
 
@@ -95,9 +119,16 @@ def lattice_directions(sites: Sites, dtype: torch.dtype) -> Tensor:
     assert sites.direction is not None
     matrix = sites.direction / power_of_two_above(sites.direction.detach().abs().amax((-1, -2)))[..., None, None]
     # Bounded plane by plane, so that a slab has the same directions as the whole.
-    z = per_view(sites.z.detach(), matrix).abs()
-    terms = _extent(matrix[:, :, None], (sites.x.abs().amax(0), sites.y.abs().amax(0), z))[..., None, None]
-    return unit_vectors(lattice_rows(matrix, sites, dtype), terms, sites.view_mask)
+    w, z = site_coordinates(sites, matrix.detach(), torch.float64)
+    a = matrix.detach().abs().amax(-2)[..., None, None, None, :]  # (B, V, 1, 1, 1, 4)
+    flat = a[..., 0] * sites.x.abs().amax(0) + a[..., 1] * sites.y.abs().amax(0) + a[..., 3]
+    z = z.detach().abs()
+    terms = flat + a[..., 2] * z[..., None, None] if w is None else flat * w.detach() + a[..., 2] * z
+    rows = lattice_rows(matrix, sites, dtype)
+    if sites.per_site:  # vectors may be as short as w, whose square underflows
+        factor = 1.0 / power_of_two_above(torch.stack(rows).detach().abs().amax(0))
+        rows, terms = [row * factor for row in rows], terms * factor
+    return unit_vectors(rows, terms, sites.view_mask)
 
 
 def point_directions(

@@ -31,9 +31,11 @@ from lsmgeo.kernels.lattice_geometry import (
     recenter,
     recentered_matrix,
     scale_below_overflow,
+    site_coordinates,
+    site_depths,
 )
 from lsmgeo.kernels.recompute import recomputed
-from lsmgeo.kernels.request import Options, Sites
+from lsmgeo.kernels.request import Options, Sites, check_site_depths
 from lsmgeo.kernels.view_statistics import view_statistics
 
 __all__ = ["OPERATORS", "why_not"]
@@ -114,7 +116,7 @@ def _output(values: Tensor, depth: Tensor | None, direction: Tensor | None, dtyp
 
 def _sample_through_cameras(
     source: Tensor, rows: Sequence[Tensor], unit: Tensor, view_mask: Tensor | None, options: Options
-) -> tuple[Tensor, Tensor, Tensor | None]:
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
     """Sample images (B, V, C, h, w) at homogeneous pixels, rows of (B, V, *sites).
 
     Args:
@@ -125,11 +127,23 @@ def _sample_through_cameras(
         options: of the call.
 
     Returns:
-        Values (B, V, C, *sites), visibility, and depth or None.
+        Values (B, V, C, *sites), visibility, depth or None, and which sites are in front.
     """
     index, front = perspective_division(rows, unit, view_mask, options)
     values, visible = _sample(source, index, front, options)
-    return values, visible, mask_views(rows[2] / unit, view_mask) if options.depth else None
+    return values, visible, mask_views(rows[2] / unit, view_mask) if options.depth else None, front
+
+
+def _correlate(values: Tensor, reference: Tensor, front: Tensor, groups: int) -> Tensor:
+    """Means over groups of channels of reference times sample: (B, V, C, *sites) -> (B, V, groups, *sites).
+
+    The reference (B, C, *sites) is not read at sites that are not in front. Products saturate.
+    """
+    reference = torch.where(front[:, :, None], reference[:, None], 0.0)
+    largest = torch.finfo(values.dtype).max
+    size = values.shape[2] // groups
+    products = (values * reference).clamp(-largest, largest) / max(size, 1)
+    return products.unflatten(2, (groups, size)).sum(3).clamp(-largest, largest)
 
 
 def _over_pieces(
@@ -164,29 +178,57 @@ def _over_pieces(
 # Operators
 
 
-def unproject(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
+def unproject(source: Tensor, sites: Sites, reference: Tensor | None, options: Options) -> tuple[Tensor, Tensor]:
     """Sample images (B, V, C, h, w) at the sites of a lattice.
+
+    Args:
+        source: the images.
+        sites: the lattice.
+        reference: (B, C, D or 1, H, W), to correlate the samples with, or None.
+        options: of the call.
 
     Returns:
         (B, V, C', D, H, W), or (B, C'', D, H, W) where options.reduce is set, and visibility (B, V, D, H, W).
     """
+    check_site_depths("unproject", sites)
     dtype, output = computing_dtype(source), source.dtype
     source = source.to(dtype)
     scale = scale_below_overflow(lattice_extent(sites.matrix, sites))[..., None]  # (B, V, 1)
 
     def piece(
-        start: int, stop: int, source: Tensor, matrix: Tensor, direction: Tensor | None, z: Tensor
+        start: int,
+        stop: int,
+        source: Tensor,
+        matrix: Tensor,
+        direction: Tensor | None,
+        z: Tensor,
+        reference: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         matrix = matrix * scale[..., None]  # homogeneous: a factor moves no pixel
-        part = sites.with_geometry(matrix, direction, z[..., start:stop])
-        unit = (per_view(part.z, matrix) * scale if part.projective else scale).to(dtype)[..., None, None]
+        part = sites.with_geometry(matrix, direction, sites.planes(z, start, stop))
         rows = lattice_rows(matrix, part, dtype)
-        values, visible, depth = _sample_through_cameras(source, rows, unit, part.view_mask, options)
+        values, visible, depth, front = _sample_through_cameras(
+            source, rows, _unit(part, scale, dtype), part.view_mask, options
+        )
+        if depth is not None and part.per_site:  # again, without division by a number next to 0
+            m = part.matrix[..., 2:, :] / scale[..., None]
+            depth = plane_rows(m.to(dtype), part)[:, :, :, None] * site_depths(part, dtype)[:, :, None]
+            depth = mask_views(depth[:, :, 0] + m[..., 2, None, None].to(dtype), part.view_mask)
+        if reference is not None:
+            at_planes = reference if reference.shape[2] == 1 else reference[:, :, start:stop]
+            values = _correlate(values, at_planes.to(dtype), front, options.groups)
         vectors = lattice_directions(part, dtype) if options.direction else None
         return _output(values, depth, vectors, dtype if options.reduce else output), visible
 
-    inputs = source, sites.matrix, sites.direction, sites.z
-    return _over_pieces(piece, sites.z.shape[-1], inputs, options, output)
+    inputs = source, sites.matrix, sites.direction, sites.z, reference
+    return _over_pieces(piece, sites.counts()[0], inputs, options, output)
+
+
+def _unit(sites: Sites, scale: Tensor, dtype: torch.dtype) -> Tensor:
+    """The third coordinate of ``M q`` at depth 1, M times `scale` (B, V, 1): broadcasts to (B, V, D, H, W)."""
+    if sites.per_site:
+        return site_coordinates(sites, sites.matrix, dtype)[1] * scale.to(dtype)[..., None, None]
+    return (per_view(sites.z, sites.matrix) * scale if sites.projective else scale).to(dtype)[..., None, None]
 
 
 def unproject_points(
@@ -208,7 +250,7 @@ def unproject_points(
         start: int, stop: int, source: Tensor, matrix: Tensor, direction: Tensor | None, points: Tensor
     ) -> tuple[Tensor, Tensor]:
         rows = point_rows(matrix * scale[..., None], points[:, start:stop], dtype)
-        values, visible, depth = _sample_through_cameras(source, rows, scale.to(dtype), view_mask, options)
+        values, visible, depth, _ = _sample_through_cameras(source, rows, scale.to(dtype), view_mask, options)
         vectors = None
         if direction is not None:
             vectors = point_directions(direction, points, slice(start, stop), view_mask, dtype)
@@ -268,18 +310,21 @@ def sample_pixels(
 def _sweep(source: Tensor, sites: Sites, options: Options, output: torch.dtype) -> tuple[Tensor, Tensor]:
     dtype = source.dtype
     m = sites.matrix.to(dtype)
-    depth = (1.0 / per_view(sites.z, sites.matrix)).to(dtype)  # (B, V, P)
+    if sites.per_site:
+        depth = site_depths(sites, dtype)
+    else:
+        depth = (1.0 / per_view(sites.z, sites.matrix)).to(dtype)[..., None, None]  # (B, V, P, 1, 1)
     front = depth > options.near
     if sites.view_mask is not None:
-        front = front & sites.view_mask[..., None]
+        front = front & sites.view_mask[..., None, None, None]
     # M q / s = depth (M_x x + M_y y + M_1) + M_z. Planes not in front get an index outside the volume.
     plane = plane_rows(m, sites).clamp(-LARGEST_COORDINATE, LARGEST_COORDINATE)
-    reach = torch.where(front, depth, 0.0)[..., None, None]
-    offset = torch.where(front[:, :, None], m[..., 2, None], OUTSIDE)[..., None, None]  # (B, V, 3, P, 1, 1)
+    reach = torch.where(front, depth, 0.0)
+    offset = torch.where(front[:, :, None], m[..., 2, None, None, None], OUTSIDE)  # (B, V, 3, P, 1, 1) or at each site
     index = [torch.addcmul(offset[:, :, row], plane[:, :, row, None], reach) for row in range(3)]
     views = source[:, None].expand(source.shape[0], sites.matrix.shape[1], *source.shape[1:])
-    values, visible = _sample(views, index, front[..., None, None], options)
-    channel = mask_views(depth, sites.view_mask)[..., None, None].expand(*depth.shape, *visible.shape[3:])
+    values, visible = _sample(views, index, front, options)
+    channel = mask_views(depth, sites.view_mask).expand(visible.shape)
     directions = lattice_directions(sites, dtype) if options.direction else None
     return _output(values, channel if options.depth else None, directions, output), visible
 
@@ -290,6 +335,7 @@ def plane_sweep_project(source: Tensor, sites: Sites, options: Options) -> tuple
     Returns:
         (B, V, C', P, h, w) and visibility (B, V, P, h, w).
     """
+    check_site_depths("plane_sweep_project", sites)
     return _sweep(source.to(computing_dtype(source)), sites, options, source.dtype)
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_choice, check_choices, check_flag, check_number, describe
-from lsmgeo.errors import OptionError
+from lsmgeo._checks import check_choice, check_choices, check_flag, check_number, check_whole, describe
+from lsmgeo.debugging import can_inspect
+from lsmgeo.errors import GridError, OptionError
 
-__all__ = ["OPERATORS", "Options", "Sites"]
+__all__ = ["OPERATORS", "Options", "Sites", "check_site_depths", "invalid_depth"]
 
 OPERATORS = ("unproject", "unproject_points", "sample_views", "plane_sweep_project", "project_reduce")
 PADDING_MODES = ("zeros", "border")
@@ -27,7 +29,8 @@ class Sites(NamedTuple):
         direction: G, (B, V, 3, 4): ``G q`` points from the camera centre to the site; None without ray directions.
         x: (W,).
         y: (H,).
-        z: (D,), (B, D) or (B, V, D).
+        z: (D,), (B, D) or (B, V, D). Where it differs from site to site, (B, 1 or V, D, H, W): there it holds *depths*,
+            float32 or float64, whose reciprocals are the third coordinates.
         projective: whether s is the third coordinate of q.
         view_mask: (B, V) bool, False for views that are left out; None keeps all.
     """
@@ -42,7 +45,16 @@ class Sites(NamedTuple):
 
     def slab(self, start: int, stop: int) -> Sites:
         """The sites of planes start to stop."""
-        return self.with_geometry(self.matrix, self.direction, self.z[..., start:stop])
+        return self.with_geometry(self.matrix, self.direction, self.planes(self.z, start, stop))
+
+    @property
+    def per_site(self) -> bool:
+        """Whether `z` holds the depth of each site."""
+        return self.z.dim() == 5
+
+    def planes(self, z: Tensor, start: int, stop: int) -> Tensor:
+        """Planes start to stop of a `z` of this form."""
+        return z[:, :, start:stop] if self.per_site else z[..., start:stop]
 
     def with_geometry(self, matrix: Tensor, direction: Tensor | None, z: Tensor) -> Sites:
         """The sites with other matrices and planes. PyTorch 2.7 does not compile `_replace`."""
@@ -50,7 +62,7 @@ class Sites(NamedTuple):
 
     def counts(self) -> tuple[int, int, int]:
         """(D, H, W)."""
-        return self.z.shape[-1], self.y.shape[0], self.x.shape[0]
+        return self.z.shape[2 if self.per_site else -1], self.y.shape[0], self.x.shape[0]
 
 
 class Options(NamedTuple):
@@ -66,6 +78,8 @@ class Options(NamedTuple):
     reduce: tuple[str, ...] = ()
     near: float = 1e-6
     flatten: bool = False  # whether planes are then stacked with the channels: fused kernels lay memory out for it
+    groups: int = 1  # of channels, where they are correlated with a reference
+    contiguous: bool = False  # whether the answer is contiguous in memory; by default it is what is fastest
     backend: str = "auto"
 
     def appended(self) -> int:
@@ -74,8 +88,7 @@ class Options(NamedTuple):
 
     def on(self, backend: str) -> Options:
         """The options with this backend. PyTorch 2.7 does not compile `_replace`."""
-        fields = self.mode, self.padding_mode, self.depth, self.direction, self.reduce, self.near, self.flatten
-        return Options(*fields, backend)
+        return Options(*self[:-1], backend)
 
     @classmethod
     def checked(
@@ -89,6 +102,8 @@ class Options(NamedTuple):
         reduce: Any = None,
         near: Any = 1e-6,
         flatten: Any = False,
+        groups: Any = 1,
+        memory_format: Any = None,
     ) -> Options:
         """Options from a user's arguments, the mode `smooth` or "nearest"; an `OptionError` names an invalid one."""
         mode = check_choice(who, "mode", smooth if mode is None else mode, (smooth, "nearest"))
@@ -100,5 +115,27 @@ class Options(NamedTuple):
             raise OptionError(f"{who}: reduce must be None or name a statistic; got {describe(reduce)}")
         distance = check_number(who, "near", near, "a finite number, at least 0", 0)
         check_flag(who, "flatten", flatten)
-        direction = frame if "direction" in extra else ""
-        return cls(mode, padding_mode, "depth" in extra, direction, statistics, distance, flatten)
+        groups = check_whole(who, "groups", groups, 1)
+        if memory_format not in (None, torch.contiguous_format):
+            raise OptionError(f"{who}: memory_format must be None or torch.contiguous_format; got {memory_format!r}")
+        direction, contiguous = frame if "direction" in extra else "", memory_format is not None
+        return cls(mode, padding_mode, "depth" in extra, direction, statistics, distance, flatten, groups, contiguous)
+
+
+def invalid_depth(operator: str, value: float) -> GridError:
+    """The error for a depth of a site that is not positive and finite."""
+    who = {"unproject": "Unproject", "plane_sweep_project": "PlaneSweepProject"}[operator]
+    return GridError(f"{who}: depths must be positive and finite; got {value:.6g}")
+
+
+def check_site_depths(operator: str, sites: Sites) -> None:
+    """Raise `invalid_depth` for the first bad depth of a view that is not masked, where values may be read."""
+    if not sites.per_site or not can_inspect(sites.z):
+        return
+    with torch.no_grad():
+        good = (sites.z > 0) & sites.z.isfinite()
+        if sites.view_mask is not None:
+            mask = sites.view_mask if sites.z.shape[1] > 1 else sites.view_mask.any(1, keepdim=True)
+            good = good | ~mask[:, :, None, None, None]
+        if not bool(good.all()):
+            raise invalid_depth(operator, sites.z[~good][0].item())

@@ -46,7 +46,8 @@ def why_not(name: str, operator: str, source: Tensor, options: Options) -> str |
 
 _SITES = "Tensor matrix, Tensor? direction, Tensor x, Tensor y, Tensor z, bool projective, Tensor? view_mask"
 _OPTIONS = (
-    "str mode, str padding_mode, bool depth, str direction_frame, str[] reduce, float near, bool flatten, str backend"
+    "str mode, str padding_mode, bool depth, str direction_frame, str[] reduce, float near, bool flatten, int groups, "
+    "bool contiguous, str backend"
 )
 _NO_OPTIONS = (None,) * len(Options._fields)  # their gradients
 
@@ -82,6 +83,9 @@ def _empty_at_sites(
 ) -> tuple[Tensor, Tensor]:
     """Empty values and visibility of views (B, V) at sites (D, H, W) or (N,), with the strides of the kernels'."""
     shape, visible = (*views, channels, *counts), source.new_empty((*views, *counts), dtype=torch.bool)
+    if options.contiguous:
+        shape = (views[0], channels * len(options.reduce), *counts) if options.reduce else shape
+        return source.new_empty(shape), visible
     if options.reduce:
         return _channels_last(source, (views[0], channels * len(options.reduce), *counts), 1), visible
     if options.flatten:
@@ -133,7 +137,7 @@ def _gradients(
 
 
 def _shared(gradient: Tensor | None, z: Tensor) -> Tensor | None:
-    """The gradient to z, (D,), (B, D) or (B, V, D), from that to the z of every view, (B, V, D)."""
+    """The gradient to z, (D,), (B, D) or (B, V, D), from that to the z of every view, (B, V, D); others as they are."""
     if gradient is None or gradient.dim() == z.dim():
         return gradient
     return gradient.sum((0, 1)) if z.dim() == 1 else gradient.sum(1)
@@ -142,54 +146,91 @@ def _shared(gradient: Tensor | None, z: Tensor) -> Tensor | None:
 # Operators: forward and backward of the kernels, fake versions of both for tracing, and the autograd rule
 
 
-class _Unproject:
-    """Images (B, V, C, h, w) at the sites of a lattice."""
+class _PlaneSweepProject:
+    """Volumes (B, C, D, H, W) at the sites of the views' frustums."""
 
-    name, channel_axis, derivatives = "unproject", 2, 4
-    schema = f"Tensor features, {_SITES}, {_OPTIONS}"
-    reference = staticmethod(reference.unproject)
+    name, channel_axis, derivatives = "plane_sweep_project", 1, 4
+    schema = f"Tensor volume, {_SITES}, {_OPTIONS}"
 
-    def forward(self, source: Tensor, *flat: Any) -> tuple[Tensor, Tensor]:
+    def forward(self, volume: Tensor, *flat: Any) -> tuple[Tensor, Tensor]:
         options = _options(flat)
-        return getattr(KERNELS[options.backend], self.name)(source, _sites(flat), options)
+        return KERNELS[options.backend].plane_sweep_project(volume, _sites(flat), options)
 
     def forward_fake(self, source: Tensor, *flat: Any) -> tuple[Tensor, Tensor]:
         sites, options = _sites(flat), _options(flat)
         channels = source.shape[self.channel_axis] + options.appended()
         return _empty_at_sites(source, sites.matrix.shape[:2], channels, sites.counts(), options)
 
-    def backward(self, gradient: Tensor, source: Tensor, *rest: Any) -> tuple[Tensor, ...]:
+    def backward(self, gradient: Tensor, volume: Tensor, *rest: Any) -> tuple[Tensor, ...]:
         *flat, needs = rest
         options = _options(flat)
-        backward = getattr(KERNELS[options.backend], f"{self.name}_backward")
-        return _tensors(gradient, backward(gradient, source, _sites(flat), options, needs), needs)
+        backward = KERNELS[options.backend].plane_sweep_project_backward
+        return _tensors(gradient, backward(gradient, volume, _sites(flat), options, needs), needs)
 
     def backward_fake(self, gradient: Tensor, source: Tensor, *flat: Any) -> tuple[Tensor, ...]:
-        matrix, direction, _, _, z, *_, needs = flat
-        to_source, to_z = _channels_last(source, source.shape, self.channel_axis), (*matrix.shape[:2], z.shape[-1])
+        sites, needs = _sites(flat), flat[-1]
+        matrix, direction, z = sites.matrix, sites.direction, sites.z
         to_direction = None if direction is None else direction.new_empty(direction.shape)
-        return _tensors(gradient, (to_source, matrix.new_empty(matrix.shape), to_direction, z.new_empty(to_z)), needs)
+        if sites.per_site:
+            to_z = z.new_empty(z.shape, dtype=torch.float32)
+        else:
+            to_z = matrix.new_empty((*matrix.shape[:2], z.shape[-1]))
+        to_source = _channels_last(source, source.shape, self.channel_axis)
+        return _tensors(gradient, (to_source, matrix.new_empty(matrix.shape), to_direction, to_z), needs)
 
     def autograd(self, ctx: Any, gradient: Tensor | None, _: Any) -> tuple[Tensor | None, ...]:
-        source, *flat = _saved(ctx)
+        volume, *flat = _saved(ctx)
         sites = _sites(flat)
-        of_source, of_matrix, of_direction, _, _, of_z, *_ = ctx.needs_input_grad
-        to_source, to_matrix, to_direction, to_z = _gradients(
+        of_volume, of_matrix, of_direction, _, _, of_z, *_ = ctx.needs_input_grad
+        to_volume, to_matrix, to_direction, to_z = _gradients(
             gradient,
-            (source, sites.matrix, sites.direction, sites.z),
-            (of_source, of_matrix, of_direction, of_z),
-            lambda needs: getattr(torch.ops.lsmgeo, f"{self.name}_backward")(gradient, source, *flat, needs),
-            lambda: self.reference(source, sites, _options(flat)),
+            (volume, sites.matrix, sites.direction, sites.z),
+            (of_volume, of_matrix, of_direction, of_z),
+            lambda needs: torch.ops.lsmgeo.plane_sweep_project_backward(gradient, volume, *flat, needs),
+            lambda: reference.plane_sweep_project(volume, sites, _options(flat)),
         )
-        return to_source, to_matrix, to_direction, None, None, _shared(to_z, sites.z), None, None, *_NO_OPTIONS
+        return to_volume, to_matrix, to_direction, None, None, _shared(to_z, sites.z), None, None, *_NO_OPTIONS
 
 
-class _PlaneSweepProject(_Unproject):
-    """Volumes (B, C, D, H, W) at the sites of the views' frustums."""
+class _Unproject(_PlaneSweepProject):
+    """Images (B, V, C, h, w) at the sites of a lattice, or their correlation with a reference (B, C, D or 1, H, W)."""
 
-    name, channel_axis = "plane_sweep_project", 1
-    schema = f"Tensor volume, {_SITES}, {_OPTIONS}"
-    reference = staticmethod(reference.plane_sweep_project)
+    name, channel_axis, derivatives = "unproject", 2, 5
+    schema = f"Tensor features, Tensor? reference, {_SITES}, {_OPTIONS}"
+
+    def forward(self, features: Tensor, other: Tensor | None, *flat: Any) -> tuple[Tensor, Tensor]:
+        options = _options(flat)
+        return KERNELS[options.backend].unproject(features, _sites(flat), other, options)
+
+    def forward_fake(self, features: Tensor, other: Tensor | None, *flat: Any) -> tuple[Tensor, Tensor]:
+        sites, options = _sites(flat), _options(flat)
+        channels = (features.shape[2] if other is None else options.groups) + options.appended()
+        return _empty_at_sites(features, sites.matrix.shape[:2], channels, sites.counts(), options)
+
+    def backward(self, gradient: Tensor, features: Tensor, other: Tensor | None, *rest: Any) -> tuple[Tensor, ...]:
+        *flat, needs = rest
+        options = _options(flat)
+        backward = KERNELS[options.backend].unproject_backward
+        return _tensors(gradient, backward(gradient, features, _sites(flat), other, options, needs), needs)
+
+    def backward_fake(self, gradient: Tensor, features: Tensor, other: Tensor | None, *flat: Any) -> tuple[Tensor, ...]:
+        to_others = super().backward_fake(gradient, features, *flat[:-1], [True] * 4)
+        to_reference = None if other is None else _channels_last(other, other.shape, 1)
+        return _tensors(gradient, (*to_others, to_reference), flat[-1])
+
+    def autograd(self, ctx: Any, gradient: Tensor | None, _: Any) -> tuple[Tensor | None, ...]:
+        features, other, *flat = _saved(ctx)
+        sites = _sites(flat)
+        of_features, of_reference, of_matrix, of_direction, _, _, of_z, *_ = ctx.needs_input_grad
+        to_features, to_matrix, to_direction, to_z, to_reference = _gradients(
+            gradient,
+            (features, sites.matrix, sites.direction, sites.z, other),
+            (of_features, of_matrix, of_direction, of_z, of_reference),
+            lambda needs: torch.ops.lsmgeo.unproject_backward(gradient, features, other, *flat, needs),
+            lambda: reference.unproject(features, sites, other, _options(flat)),
+        )
+        to_sites = to_matrix, to_direction, None, None, _shared(to_z, sites.z), None, None
+        return to_features, to_reference, *to_sites, *_NO_OPTIONS
 
 
 class _SampleViews:

@@ -52,6 +52,49 @@ def test_gradients_of_a_graph():
         torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-4)
 
 
+def matching_costs(features, K, E, depths, reference):
+    """Depths of pixels and correlation: what a cascade computes."""
+    cameras = CameraTensors(K, E, 24, 32)
+    grid = FrustumGrid(CameraTensors(K[:, 0], E[:, 0], 24, 32), depths)
+    cost = functional.unproject(features, cameras, grid, reference=reference, groups=2, reduce=("mean", "max"))
+    maps = functional.plane_sweep_project(cost.volume, cameras, VoxelGrid(grid.shape), depths[:, None].expand(
+        -1, features.shape[1], -1, -1, -1
+    ))  # fmt: skip
+    return cost.volume, maps.maps
+
+
+def matching_inputs():
+    features, K, E, *_ = arguments(2, 3)
+    generator = torch.Generator().manual_seed(3)
+    depths = 1.5 + torch.rand(2, 4, 5, 6, generator=generator)
+    return features, K, E, depths, torch.rand(2, features.shape[2], 1, 5, 6, generator=generator)
+
+
+def test_depths_of_pixels_and_correlation_compile():
+    def energy(*leaves):
+        return sum(answer.square().sum() for answer in matching_costs(*leaves))
+
+    leaves = [tensor.requires_grad_() for tensor in matching_inputs()]
+    compiled = torch.compile(energy, fullgraph=True, backend="aot_eager")
+    actual, expected = (torch.autograd.grad(run(*leaves), leaves) for run in (compiled, energy))
+    for mine, other in zip(actual, expected, strict=True):
+        assert other.abs().max() > 0
+        torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
+def test_depths_of_pixels_and_correlation_export():
+    class Costs(torch.nn.Module):
+        def forward(self, *given):
+            return matching_costs(*given)
+
+    given = matching_inputs()
+    program = torch.export.export(Costs(), given)
+    for found, expected in zip(program.module()(*given), matching_costs(*given), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+        assert expected.abs().sum() > 0
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", UNPROJECTIONS)
 def test_one_graph(name):

@@ -227,7 +227,8 @@ def test_layers_print_themselves():
     layer = Unproject(VoxelGrid((2, 3, 4)), augment="depth", near=0.5)
     assert repr(layer) == (
         "Unproject(VoxelGrid((2, 3, 4), lower=(-0.5, -0.5, -0.5), upper=(0.5, 0.5, 0.5)), mode='bilinear', "
-        "padding_mode='zeros', augment='depth', direction_frame='world', reduce=None, near=0.5, backend='auto')"
+        "padding_mode='zeros', augment='depth', direction_frame='world', reduce=None, near=0.5, "
+        "groups=1, memory_format=None, backend='auto')"
     )
 
 

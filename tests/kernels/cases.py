@@ -9,7 +9,16 @@ import torch
 
 from lsmgeo import FrustumGrid, VoxelGrid, cameras
 from lsmgeo.cameras import CameraTensors
-from tests.kernels.comparison import Call, compare, points_call, reduce_call, sweep_call, unproject_call, views_call
+from tests.kernels.comparison import (
+    Call,
+    compare,
+    frustum_call,
+    points_call,
+    reduce_call,
+    sweep_call,
+    unproject_call,
+    views_call,
+)
 
 B, V, C = 2, 3, 5
 _generator = torch.Generator().manual_seed(3)
@@ -46,12 +55,17 @@ DEPTHS = torch.tensor([0.62, 1.11, 1.43, 2.07, 2.9])
 SIZE = (5, 6)
 MASK = torch.tensor([[True, True, False], [True, False, True]])
 WEIGHT, BIAS = _random(4, C * 5), _random(4)
+CAMERA = VIEWS.at((slice(None), 0))
+# Depths of each pixel, for each view of a sweep or shared by all, in no order; some pixels have the same ones twice.
+PIXEL_DEPTHS = 1.7 + 2.4 * _random(B, V, 4, *SIZE)
+PIXEL_DEPTHS[:, :, 1] = PIXEL_DEPTHS[:, :, 3]
+FRUSTUM = (VIEWS, CAMERA, PIXEL_DEPTHS[:, 0])
+REFERENCE, PLANE_REFERENCES = _random(B, 7 * C, 1, *SIZE), _random(B, 7 * C, 4, *SIZE)
 
 
 def frustum(size: tuple[int, int] = SIZE) -> FrustumGrid:
     """Projective, with depths of their own for each scene."""
-    reference = CameraTensors(*(field[:, 0] for field in VIEWS))
-    return FrustumGrid(reference, torch.stack((DEPTHS, 1.1 * DEPTHS)), size)
+    return FrustumGrid(CAMERA, torch.stack((DEPTHS, 1.1 * DEPTHS)), size)
 
 
 def _both(**options: Any) -> dict[str, Any]:
@@ -99,6 +113,31 @@ CASES: dict[str, Callable[[str], None]] = {
     "nearest sweep": _case(sweep_call, *SWEEP, flatten=False, mode="nearest", **_both(direction_frame="camera")),
     "nearest sweep, stacked, near": _case(sweep_call, *SWEEP, flat=5, mode="nearest", near=1.2),
     "reduced sweep": _case(reduce_call, *SWEEP, WEIGHT, BIAS),
+    "depths of pixels": _case(frustum_call, WIDE, *FRUSTUM, view_mask=MASK, **_both()),
+    "depths of pixels, float64": _case(frustum_call, FEATURES, VIEWS, CAMERA, PIXEL_DEPTHS[:, 0].double(), near=1.1),
+    "depths of pixels, nearest": _case(frustum_call, FEATURES, *FRUSTUM, mode="nearest", **_both()),
+    "depths of pixels, variance": _case(frustum_call, WIDE, *FRUSTUM, reduce="variance", padding_mode="border"),
+    "depths of pixels, statistics": _case(
+        frustum_call, FEATURES, *FRUSTUM, reduce=_EVERY, **_both(direction_frame="camera")
+    ),
+    "sweep of pixels' depths": _case(
+        sweep_call, *SWEEP[:3], PIXEL_DEPTHS, SIZE, flatten=False, view_mask=MASK, **_both()
+    ),
+    "sweep of pixels' depths, zeros": _case(sweep_call, *SWEEP[:3], PIXEL_DEPTHS, SIZE, flatten=False),
+    "sweep of pixels' depths, stacked": _case(
+        sweep_call, WIDE_VOLUME, *SWEEP[1:3], PIXEL_DEPTHS, SIZE, flat=4, padding_mode="border"
+    ),
+    "correlation": _case(frustum_call, WIDE, VIEWS, CAMERA, DEPTHS, REFERENCE, SIZE, view_mask=MASK, **_both()),
+    "correlation, groups": _case(frustum_call, WIDE, *FRUSTUM, PLANE_REFERENCES, groups=7, padding_mode="border"),
+    "correlation, each channel": _case(frustum_call, WIDE, *FRUSTUM, REFERENCE, groups=7 * C, mode="nearest"),
+    "correlation, mean": _case(frustum_call, WIDE, VIEWS, CAMERA, DEPTHS[:4], PLANE_REFERENCES, SIZE, reduce="mean"),
+    "correlation, mean of groups": _case(frustum_call, WIDE, *FRUSTUM, REFERENCE, groups=5, reduce="mean"),
+    "correlation, statistics": _case(
+        frustum_call, WIDE, *FRUSTUM, REFERENCE, groups=7, reduce=_EVERY, view_mask=MASK, **_both()
+    ),
+    "contiguous": _case(
+        unproject_call, WIDE, VIEWS, GRID, reduce=("mean", "variance"), memory_format=torch.contiguous_format
+    ),
 }
 HALF: dict[str, Callable[[str], None]] = {
     f"{name}, {dtype}".replace("torch.", ""): case
@@ -109,6 +148,11 @@ HALF: dict[str, Callable[[str], None]] = {
         "trilinear": _case(sweep_call, WIDE_VOLUME.to(dtype), *SWEEP[1:], flat=5, padding_mode="border", **_both()),
         "pixels": _case(views_call, WIDE.to(dtype), PIXELS, DISTANCE, VALID),
         "one channel": _case(unproject_call, FEATURES[:, :, :1].to(dtype), VIEWS, GRID, padding_mode="border"),
+        "depths of pixels": _case(frustum_call, WIDE.to(dtype), *FRUSTUM, **_both()),
+        "correlation": _case(frustum_call, WIDE.to(dtype), *FRUSTUM, REFERENCE.to(dtype), groups=7),
+        "correlation, mean": _case(
+            frustum_call, WIDE.to(dtype), *FRUSTUM, PLANE_REFERENCES.to(dtype), groups=5, reduce="mean"
+        ),
         "small numbers": _case(unproject_call, (1e-5 * WIDE).to(dtype), VIEWS, GRID, padding_mode="border"),
     }.items()
 }
@@ -125,6 +169,10 @@ LARGE = (1020.0 * torch.rand(WIDE.shape, generator=_generator)).half()
 HALF |= {
     "variance that saturates": _case(unproject_call, LARGE, VIEWS, GRID, reduce="variance"),
     "statistics that saturate": _case(unproject_call, LARGE, FAR_VIEWS, FAR_GRID, reduce=_EVERY, **_both()),
+    "correlation that saturates": _case(frustum_call, LARGE, *FRUSTUM, (400.0 * REFERENCE).half(), groups=7),
+    "correlation that saturates, mean": _case(
+        frustum_call, LARGE, *FRUSTUM, (400.0 * REFERENCE).half(), groups=7, reduce="mean"
+    ),
     "depth that saturates": _case(unproject_call, FEATURES.half(), FAR_VIEWS, FAR_GRID, **_both()),
     "swept depth that saturates": _case(
         sweep_call, VOLUME.half(), FAR_VIEWS, FAR_GRID, UNIT * DEPTHS, SIZE, flatten=False, **_both()

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from lsmgeo import functional, rays
+from lsmgeo import FrustumGrid, functional, rays
 from lsmgeo._dtypes import saturation_limit
 from lsmgeo.cameras import CameraTensors
 from lsmgeo.kernels import OPERATORS, reference
@@ -41,6 +41,25 @@ def unproject_call(features: Tensor, cameras: CameraTensors, grid: Any, **option
         return functional.unproject(features, moved, grid, **options, **backend)
 
     return Call("unproject", run, (features, cameras.intrinsics, cameras.cam_from_world))
+
+
+def frustum_call(
+    features: Tensor,
+    cameras: CameraTensors,
+    camera: CameraTensors,
+    depths: Tensor,
+    reference: Tensor | None = None,
+    size: tuple[int, int] | None = None,
+    **options: Any,
+) -> Call:
+    def run(features: Tensor, K: Tensor, E: Tensor, depths: Tensor, *reference: Tensor, **backend: Any) -> Any:
+        moved = cameras._replace(intrinsics=K, cam_from_world=E)
+        grid = FrustumGrid(camera, depths, size)
+        other = reference[0] if reference else None
+        return functional.unproject(features, moved, grid, reference=other, **options, **backend)
+
+    leaves = (features, cameras.intrinsics, cameras.cam_from_world, depths)
+    return Call("unproject", run, leaves if reference is None else (*leaves, reference))
 
 
 def points_call(features: Tensor, cameras: CameraTensors, points: Tensor, **options: Any) -> Call:

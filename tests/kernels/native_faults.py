@@ -30,8 +30,8 @@ FAULTS = {
     "one channel's unread sites": ("values[s] = $tile.in_range[s] ? values[s] : 0.0f$;", "values[s]"),
     "one channel's rest forgotten": ("$s < padded$; s += LANES", "s + LANES <= n"),
     "tiles at the volume's edge passed over": (
-        "if ($index[axis][0] < -1.01 && index[axis][1] < -1.01$) return true;",
-        "index[axis][0] < 0.4 && index[axis][1] < 0.4",
+        "if ($most[axis] < -1.01$ || least[axis] > double(call.size[axis]) + 0.01) return true;",
+        "most[axis] < 0.4",
     ),
     "rest of the channels forgotten": ("for (; $c < channels$; c++) body", "c < channels - 1"),
     "slope with the wrong sign": (
@@ -41,7 +41,7 @@ FAULTS = {
     "depth without its slope": ("rows[2][s] += $float(grad_height)$;", "0.0f"),
     "height's part forgotten": ("rows[2][s] = -($rows[0][s]$ * tile.index[0][s]", "0.0f"),
     "inverse depth's part forgotten": (
-        "grad_z[s] -= $double(grad_plane) * tile.plane[row][s] * tile.depth[s]$;",
+        "grad_z[s] += per_site ? grad_depth : $-grad_depth * tile.depth[s] * tile.depth[s]$;",
         "0.0",
     ),
     "direction's slope not projected": (
@@ -70,6 +70,36 @@ FAULTS = {
     "statistics that saturate differentiated": (
         "gradient = $clamped_lanes<W>(result, limit) == result ? gradient : Floats<W>{}$;",
         "gradient",
+    ),
+    "one depth for a whole row": ("tile.depth[s] = $depths[s * step]$;", "depths[0]"),
+    "depths of another plane": ("tile.view * stride[1] + $tile.k$ * stride[2] + tile.j * stride[3] +\n", "0"),
+    "own depths of all views": (
+        "call.depths_gradient + chunk * stride[0] + tile.scene * stride[1] + $tile.view * stride[2]$ +",
+        "0",
+    ),
+    "w forgotten in the depth": ("height[s] = (slope[2] * x + base[2]) * $w$ + inner[2] * z;", "1.0f"),
+    "w forgotten in the direction": ("vector[row][s] = (slope * tile.x[s] + base) * $tile.w[s]$ +", "1.0f"),
+    "near not in units of own depths": ("bound = $near * z$;", "near"),
+    "own depth's gradient of the wrong sign": (
+        "grad_depth[s] -= $double(rows[row][s]) * view.matrix[row][2]$ * tile.z[s]",
+        "-double(rows[row][s]) * view.matrix[row][2]",
+    ),
+    "own depth's direction forgotten": ("grad_z[s] += per_site ? $-along * inner * tile.z[s] / tile.depth[s]$", "0.0"),
+    "own depth of a volume forgotten": ("grad_z[s] += per_site ? $grad_depth$ : -grad_depth", "0.0"),
+    "matrix's gradient by the planes": ("to[2] += view.scale * (per_site ? $double(sum_z)$ :", "double(sum)"),
+    "nearest of own depths passed over": ("range[1] = $std::max(range[1], tile.depth[s])$;", "range[0]"),
+    "correlation not a mean": ("const float share = $1.0f / float(size)$;\n    for (int64_t group", "1.0f"),
+    "reference of the first plane": ("channel * stride[1] + $tile.k$ * stride[2] + tile.j * stride[3]", "0"),
+    "groups mixed up": ("*b = reference + $group * size$;", "0"),
+    "correlation's gradient not a mean": ("const float factor = $gradient[group] / float(size)$;", "gradient[group]"),
+    "last view's part of the reference's gradient": ("for (; c < end; c++) out[c] += $factor * other[c]$;", "0.0f"),
+    "mean's share forgotten for correlations": (
+        "workspace.value_gradients[group] = $gradient[group] * share$;",
+        "gradient[group]",
+    ),
+    "correlations that saturate differentiated": (
+        "$std::fabs(workspace.value_gradients[group]) <= limit ? gradient[group] : 0.0f$;",
+        "gradient[group]",
     ),
     "gradient not cleared": ("if ($!call.source_gradient || call.accumulate$) return;", "true"),
     "bfloat16 cut off": ("$(bits + 0x7fff + (bits >> 16 & 1)) >> 16$;", "bits >> 16"),

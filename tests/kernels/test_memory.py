@@ -14,7 +14,7 @@ from torch.autograd.graph import saved_tensors_hooks
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from lsmgeo import VoxelGrid, cameras, depth_planes, functional, rays
+from lsmgeo import FrustumGrid, VoxelGrid, cameras, depth_planes, functional, rays
 
 V, C, P = 12, 16, 24
 MAP = (20, 26)
@@ -124,6 +124,22 @@ class TestReductionOverViews:
         expected.backward(cotangent)
         assert features.grad.abs().max() > 0
         torch.testing.assert_close(features.grad, whole.grad, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("names", ["mean", "variance"])
+def test_correlations_are_reduced_without_volumes_of_all_views(names):
+    frustum = FrustumGrid(VIEWS.at((slice(None), 0)), DEPTHS, MAP)
+    volumes = (V - 1) * C * P * MAP[0] * MAP[1]
+    own = torch.rand(1, C, 1, *MAP, generator=torch.Generator().manual_seed(2))
+
+    def correlated(reference: Tensor) -> Tensor:
+        return functional.unproject(
+            leaf(FEATURES), VIEWS, frustum, reference=reference, groups=4, reduce=names, backend="reference"
+        ).volume
+
+    for backward in (False, True):
+        assert largest(lambda: correlated(leaf(own)), backward) <= volumes / 3
+    assert kept(lambda: correlated(leaf(own))) <= 2 * FEATURES.numel() + own.numel() + 1e4
 
 
 class TestReductionOverRays:

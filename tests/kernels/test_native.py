@@ -12,7 +12,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lsmgeo import functional, rays
+from lsmgeo import FrustumGrid, functional, rays
 from lsmgeo._sites import image_sites, sweep_sites
 from lsmgeo.errors import BackendError
 from lsmgeo.kernels import Options, explain
@@ -174,17 +174,18 @@ def test_the_same_bits_from_run_to_run(operator, threads):
 
 
 def test_memory_that_is_given_is_written_to():
-    options = Options.checked("test", "bilinear")
-    sites = image_sites("test", cases.WIDE, cases.VIEWS, cases.GRID, None, options)
-    expected, _ = library.unproject(cases.WIDE, sites, options)
-    out = torch.full(expected.shape, torch.nan)  # contiguous, unlike what the kernel would make
-    found, _ = library.unproject(cases.WIDE, sites, options, out)
+    options = Options.checked("test", "trilinear")
+    volume = cases.WIDE_VOLUME
+    sites = sweep_sites("test", volume, cases.VIEWS, cases.GRID, cases.DEPTHS, cases.SIZE, None, options)
+    expected, _ = library.plane_sweep_project(volume, sites, options)
+    out = torch.full(expected.shape, torch.nan).movedim(2, 3).contiguous().movedim(3, 2)  # unlike what it would make
+    found, _ = library.plane_sweep_project(volume, sites, options, out)
     assert found is out
     torch.testing.assert_close(out, expected, rtol=0, atol=0)
     needs = (True, False, False, False)
-    gradient, *_ = library.unproject_backward(expected, cases.WIDE, sites, options, needs)
+    gradient, *_ = library.plane_sweep_project_backward(expected, volume, sites, options, needs)
     into = torch.ones_like(gradient)
-    library.unproject_backward(expected, cases.WIDE, sites, options, needs, into)
+    library.plane_sweep_project_backward(expected, volume, sites, options, needs, into)
     torch.testing.assert_close(into, gradient + 1.0)
 
 
@@ -203,21 +204,27 @@ def test_half_volumes_swept_into_float32():
 
 # opcheck looks at the gradients of tensors that have none.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-@pytest.mark.parametrize("operator", ["unproject", "sample_views", "plane_sweep_project", "project_reduce"])
+@pytest.mark.parametrize(
+    "operator", ["unproject", "correlation", "sample_views", "plane_sweep_project", "pixel_sweep", "project_reduce"]
+)
 def test_opcheck(operator):
-    options = Options.checked(
-        "test", "trilinear" if operator in ("plane_sweep_project", "project_reduce") else "bilinear", augment="depth"
-    ).on("cpu")
-    leaf = (cases.FEATURES if operator in ("unproject", "sample_views") else cases.VOLUME).clone().requires_grad_()
+    smooth = "bilinear" if operator in ("unproject", "correlation", "sample_views") else "trilinear"
+    options = Options.checked("test", smooth, augment="depth", groups=5 if operator == "correlation" else 1).on("cpu")
+    leaf = (cases.FEATURES if smooth == "bilinear" else cases.VOLUME).clone().requires_grad_()
     if operator == "sample_views":
         arguments = (leaf, cases.PIXELS.clone().requires_grad_(), cases.VALID, cases.DISTANCE[:, :, None])
     elif operator == "unproject":
-        arguments = (leaf, *image_sites("test", leaf, cases.VIEWS, cases.GRID, cases.MASK, options))
+        arguments = (leaf, None, *image_sites("test", leaf, cases.VIEWS, cases.GRID, cases.MASK, options))
+    elif operator == "correlation":
+        grid = FrustumGrid(cases.CAMERA, cases.PIXEL_DEPTHS[:, 0].clone().requires_grad_())
+        other = cases.REFERENCE[:, : cases.C].clone().requires_grad_()
+        arguments = (leaf, other, *image_sites("test", leaf, cases.VIEWS, grid, cases.MASK, options, other))
+        operator = "unproject"
     else:
-        arguments = (
-            leaf,
-            *sweep_sites("test", leaf, cases.VIEWS, cases.GRID, cases.DEPTHS, cases.SIZE, None, options),
-        )
+        depths = cases.PIXEL_DEPTHS.clone().requires_grad_() if operator == "pixel_sweep" else cases.DEPTHS
+        sites = sweep_sites("test", leaf, cases.VIEWS, cases.GRID, depths, cases.SIZE, None, options)
+        arguments = (leaf, *sites)
+        operator = "plane_sweep_project" if operator == "pixel_sweep" else operator
         if operator == "project_reduce":
             planes = cases.DEPTHS.shape[0]
             arguments = (leaf, torch.rand(3, cases.C + 1, planes, requires_grad=True), None, *arguments[1:])

@@ -22,7 +22,9 @@ FEATURES = torch.zeros(1, 2, 3, 4, 5)
 # Each group is run in a process of its own. The faults of the short form are every other one.
 GROUPS = {
     "images": [name for name in CASES if name.startswith("images")],
-    "others": [name for name in CASES if not name.startswith("images")],
+    "shared": [name for name in CASES if name.startswith("shared")][::2],
+    "others shared": [name for name in CASES if name.startswith("shared")][1::2],
+    "others": [name for name in CASES if not name.startswith(("images", "shared"))],
 }
 SOUND, *BROKEN = FAULTS
 
@@ -35,7 +37,9 @@ def assert_right(table, names):
 
 
 @needs_triton
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize(
+    "group", [pytest.param(name, marks=pytest.mark.long if name == "others shared" else ()) for name in GROUPS]
+)
 def test_kernels_equal_the_reference(group):
     assert_right("cases", GROUPS[group])
 

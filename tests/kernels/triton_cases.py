@@ -7,14 +7,17 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from functools import partial
 from unittest import mock
 
 import torch
 from torch import Tensor
 
+from lsmgeo import FrustumGrid, _sites
 from lsmgeo.kernels import reference
 from lsmgeo.kernels.request import Options
 from lsmgeo.kernels.triton import launcher, operators
+from tests.kernels import cases as shared
 from tests.kernels.triton_support import (
     CELLS,
     SHAPE,
@@ -32,6 +35,9 @@ from tests.kernels.triton_support import (
     points,
     sample_pixels,
     sweep_sites,
+    unproject,
+    unproject_backward,
+    unproject_reference,
     volumes,
 )
 
@@ -136,9 +142,9 @@ def images_of_any_strides() -> None:
     sites = image_sites(10)
     last = features(4).permute(0, 1, 3, 4, 2).contiguous().permute(0, 1, 4, 2, 3)
     compare(last, sites, Options("bilinear"))
-    shared = features(4)[:, :1].expand(B, V, 4, 5, 7)
+    expanded = features(4)[:, :1].expand(B, V, 4, 5, 7)
     ones = torch.ones(()).expand(B, V, 4, *SHAPE)
-    compare(shared, sites, Options("bilinear"), cotangent=ones)
+    compare(expanded, sites, Options("bilinear"), cotangent=ones)
     turned = torch.randn(*SHAPE, 9, B, generator=generator(11)).permute(4, 3, 0, 1, 2)
     compare(features(3).mT.contiguous().mT, sites, Options("bilinear", reduce=EVERY), cotangent=turned)
 
@@ -150,9 +156,9 @@ def half_precision_saturates() -> None:
     far = sites._replace(matrix=sites.matrix * 6e4)
     source = (300.0 * features(2)).half()
     for place, options in ((far, Options("bilinear", depth=True)), (sites, Options("bilinear", reduce=EVERY))):
-        shape = reference.unproject(source, place, options)[0].shape
+        shape = unproject_reference(source, place, options)[0].shape
         cotangent = torch.randn(shape, generator=generator(3)).half()
-        values, visible, gradients = by_reference(reference.unproject, source, place, options, cotangent)
+        values, visible, gradients = by_reference(unproject_reference, source, place, options, cotangent)
         found = by_kernels(source, place, options, cotangent)
         assert float(values.abs().max()) == 65504.0
         assert_finite(found[0], *found[2])
@@ -170,24 +176,24 @@ def the_largest_of_minus_infinity() -> None:
     """An unseen view does not stand for it, and what no view sees stays 0."""
     source, sites = torch.full_like(features(2), -torch.inf), image_sites(7, mask=True)
     options = Options("nearest", reduce=("max",))
-    found, visible = operators.unproject(source, sites, options)
+    found, visible = unproject(source, sites, options)
     expected = torch.where(visible.any(1), -torch.inf, 0.0)[:, None].expand_as(found)
     assert bool(visible.any(1).any())
     assert not bool(visible.any(1).all())
     torch.testing.assert_close(found, expected, rtol=0, atol=0)
-    torch.testing.assert_close(reference.unproject(source, sites, options)[0], expected, rtol=0, atol=0)
+    torch.testing.assert_close(unproject_reference(source, sites, options)[0], expected, rtol=0, atol=0)
 
 
 @case
 def large_numbers_stay_finite() -> None:
     source = 3e38 * features(2).sign()
     sites, options = image_sites(), Options("bilinear", "border", reduce=EVERY)
-    values, _, _ = by_reference(reference.unproject, source, sites, options, torch.ones(B, 6, *SHAPE))
+    values, _, _ = by_reference(unproject_reference, source, sites, options, torch.ones(B, 6, *SHAPE))
     cotangent = torch.full((B, 6, *SHAPE), 1e-20)
     found = by_kernels(source, sites, options, cotangent)
     assert_finite(found[0], found[2][0])
     torch.testing.assert_close(found[0], values, rtol=1e-5, atol=1e33)
-    _, _, gradients = by_reference(reference.unproject, source, sites, options, cotangent)
+    _, _, gradients = by_reference(unproject_reference, source, sites, options, cotangent)
     torch.testing.assert_close(found[2][0], gradients[0], rtol=1e-4, atol=1e-4 * float(gradients[0].abs().max()))
 
 
@@ -214,18 +220,18 @@ def nan_reaches_its_footprint_alone() -> None:
         Options("nearest", "border", reduce=("mean",)),
         Options("bilinear", reduce=EVERY),
     ):
-        values, visible = reference.unproject(source, sites, options)
-        found, seen = operators.unproject(source, sites, options)
+        values, visible = unproject_reference(source, sites, options)
+        found, seen = unproject(source, sites, options)
         assert bool(values.isnan().any())
         assert not bool(values.isnan().all())
         torch.testing.assert_close(found, values, rtol=1e-4, atol=1e-4, equal_nan=True)
         torch.testing.assert_close(seen, visible, rtol=0, atol=0)
         clean = torch.ones_like(values)
         clean[0] = 0.0  # no gradient comes from where the NaN are
-        assert_finite(*operators.unproject_backward(clean, source, sites, options, (True, False, False, False)))
+        assert_finite(*unproject_backward(clean, source, sites, options, (True, False, False, False)))
         if "variance" not in options.reduce:  # finite gradients do not meet the features
-            expected = by_reference(reference.unproject, source, sites, options, torch.ones_like(values))[2][0]
-            gradient, *_ = operators.unproject_backward(
+            expected = by_reference(unproject_reference, source, sites, options, torch.ones_like(values))[2][0]
+            gradient, *_ = unproject_backward(
                 torch.ones_like(values), source, sites, options, (True, False, False, False)
             )
             torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-4)
@@ -275,7 +281,7 @@ def whole_indices_belong_to_the_cell_above() -> None:
     for padding in ("zeros", "border"):
         options = Options("bilinear", padding)
         cotangent = torch.randn(B, V, 2, 1, 7, 9, generator=generator(8))
-        values, visible, gradients = by_reference(reference.unproject, features(2), sites, options, cotangent)
+        values, visible, gradients = by_reference(unproject_reference, features(2), sites, options, cotangent)
         found = by_kernels(features(2), sites, options, cotangent)
         torch.testing.assert_close(found[1], visible, rtol=0, atol=0)
         torch.testing.assert_close(found[0], values, rtol=0, atol=1e-4)
@@ -283,8 +289,8 @@ def whole_indices_belong_to_the_cell_above() -> None:
         torch.testing.assert_close(found[2][1], gradients[1], rtol=1e-4, atol=1e-3)
     halves = sites._replace(matrix=matrix + torch.tensor([0.0, 0.0, 0.0, 0.5])[:, None].mT * matrix[..., 2:, 3:])
     options = Options("nearest")
-    expected, visible = reference.unproject(features(2), halves, options)
-    found, seen = operators.unproject(features(2), halves, options)
+    expected, visible = unproject_reference(features(2), halves, options)
+    found, seen = unproject(features(2), halves, options)
     torch.testing.assert_close(found, expected, rtol=0, atol=0)
     torch.testing.assert_close(seen, visible, rtol=0, atol=0)
 
@@ -319,10 +325,10 @@ def nothing_gives_nothing() -> None:
 def only_what_is_needed() -> None:
     sites, source = image_sites(14, batch=1, views=2), features(2, batch=1, views=2)
     cotangent = torch.randn(1, 2, 6, *SHAPE, generator=generator(9))
-    everything = operators.unproject_backward(cotangent, source, sites, AUGMENTED, (True,) * 4)
+    everything = unproject_backward(cotangent, source, sites, AUGMENTED, (True,) * 4)
     for index in range(4):
         needs = tuple(index == other for other in range(4))
-        found = operators.unproject_backward(cotangent, source, sites, AUGMENTED, needs)
+        found = unproject_backward(cotangent, source, sites, AUGMENTED, needs)
         assert [gradient is not None for gradient in found] == list(needs)
         torch.testing.assert_close(found[index], everything[index], rtol=1e-6, atol=1e-6)
 
@@ -421,9 +427,38 @@ def deterministic_sums() -> None:
         shape = (B, count, *SHAPE) if options.reduce else (B, V, count, *SHAPE)
         cotangent = 1e-9 * torch.randn(shape, generator=generator(2))
         needs = (True, True, True, True)
-        expected = operators.unproject_backward(cotangent, features(), sites, options, needs)
+        expected = unproject_backward(cotangent, features(), sites, options, needs)
         with deterministic():
-            found = [operators.unproject_backward(cotangent, features(), sites, options, needs) for _ in range(2)]
+            found = [unproject_backward(cotangent, features(), sites, options, needs) for _ in range(2)]
         for first, second, other in zip(*found, expected, strict=True):
             torch.testing.assert_close(first, second, rtol=0, atol=0)
             torch.testing.assert_close(first, other, rtol=0, atol=1e-6 * float(other.abs().max()))
+
+
+# Depths of sites, correlation, contiguous memory: the scenes of the C++ kernels
+
+SHARED = [
+    name
+    for name in shared.CASES
+    if name.startswith(("depths of pixels", "sweep of pixels", "correlation", "contiguous"))
+]
+CASES |= {f"shared, {name}": partial(shared.CASES[name], "triton") for name in SHARED}
+CASES["shared, half"] = partial(shared.HALF["correlation that saturates"], "triton")
+
+
+@case
+def deterministic_sums_of_correlations() -> None:
+    grid = FrustumGrid(shared.CAMERA, shared.PIXEL_DEPTHS[:, 0])
+    options = Options("bilinear", "border", groups=5, reduce=("mean", "variance"))
+    source, other = shared.WIDE, shared.REFERENCE
+    sites = _sites.image_sites("test", source, shared.VIEWS, grid, None, options, other)
+    cotangent = torch.randn(shared.B, 10, *grid.shape, generator=generator(2))
+    arguments = (cotangent, source, sites, other, options, (True,) * 5)
+    expected = operators.unproject_backward(*arguments)
+    with deterministic():
+        found = [operators.unproject_backward(*arguments) for _ in range(2)]
+    for first, second, other in zip(*found, expected, strict=True):
+        if other is None:
+            continue
+        torch.testing.assert_close(first, second, rtol=0, atol=0)
+        torch.testing.assert_close(first, other, rtol=0, atol=1e-5 * float(other.abs().max()))

@@ -11,6 +11,7 @@ import itertools
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -19,6 +20,7 @@ import torch
 
 from lsmgeo.kernels.request import Options
 from lsmgeo.kernels.triton import launch_tables, launcher, operators
+from tests.kernels import cases as shared
 from tests.kernels.triton_support import compare, compare_sweep, features, image_sites, sweep_sites, volumes
 
 FOLDER = Path(operators.__file__).parent
@@ -41,6 +43,9 @@ COMPARISONS: dict[str, Callable[[], object]] = {
         features(2), image_sites(23), Options("bilinear", reduce=("mean", "variance", "max"))
     ),
     "ties": lambda: compare(PAIR[:, :1].expand_as(PAIR), SAME, Options("bilinear", reduce=("max",))),
+    "own depths": partial(shared.CASES["depths of pixels"], "triton"),
+    "own sweep": partial(shared.CASES["sweep of pixels' depths"], "triton"),
+    "correlation": partial(shared.CASES["correlation, groups"], "triton"),
     "sweep": lambda: compare_sweep(volumes(2), sweep_sites(25), Options("trilinear", "border", depth=True, near=0.6)),
 }
 
@@ -55,8 +60,8 @@ class Fault(NamedTuple):
 CHANGES = {
     "pixels half a pixel off": Fault(
         KERNELS,
-        "x = tl.where(front, _row(table, site.x, site.y, along) * inverse, OUTSIDE)",
-        "x = tl.where(front, _row(table, site.x, site.y, along) * inverse + 0.5, OUTSIDE)",
+        "x = tl.where(front, _row(table, site, w, along, CONFIG) * inverse, OUTSIDE)",
+        "x = tl.where(front, _row(table, site, w, along, CONFIG) * inverse + 0.5, OUTSIDE)",
         "zeros",
     ),
     "the lower cell for the nearest": Fault(KERNELS, "index - cell >= 0.5", "index - cell >= 1.5", "masked"),
@@ -106,7 +111,7 @@ CHANGES = {
         "zeros",
     ),
     "directions not normalised in backward": Fault(
-        GRADIENTS, "(grad_x - along * x) * inverse", "grad_x * inverse", "views"
+        GRADIENTS, "(grad_x - along * unit_x) * inverse", "grad_x * inverse", "views"
     ),
     "half of the variance's derivative": Fault(
         GRADIENTS, "2.0 * deviation * grad_square", "deviation * grad_square", "statistics"
@@ -114,12 +119,33 @@ CHANGES = {
     "gradients to views that see nothing": Fault(
         GRADIENTS, "grad = tl.where(projection.visible[:, None], grad, 0.0)", "grad = grad", "statistics"
     ),
-    "masked depths with a gradient": Fault(
-        GRADIENTS, " & _is_unmasked(lattice.views + view * FIELDS, site)", " & site.keep", "masked"
-    ),
+    "masked depths with a gradient": Fault(GRADIENTS, " & _is_unmasked(table, site)", " & site.keep", "masked"),
     "no gradient through s": Fault(TABLES, "through = -extra[..., 3] / z", "through = through", "views"),
     "a sweep's offset taken for a slope": Fault(
         TABLES, "_matrix_sums(rows, depth, torch.ones_like(depth))", "_matrix_sums(rows, depth, depth)", "sweep"
+    ),
+    "one depth for all rows": Fault(KERNELS, "site.j.to(tl.int64) * array.y + site.i", "site.i", "own depths"),
+    "w forgotten": Fault(KERNELS, "plane = plane * w", "plane = plane", "own depths"),
+    "own depth's gradient of the wrong sign": Fault(
+        GRADIENTS, "to_depth = -_along_z(table", "to_depth = _along_z(table", "own depths"
+    ),
+    "own depth's direction forgotten": Fault(
+        GRADIENTS, "to_depth -= tl.div_rn(inner * z, own)", "to_depth = to_depth", "own depths"
+    ),
+    "own depths of a sweep by one row": Fault(
+        GRADIENTS, "to_depth += grad_z * _clamped", "to_depth += 0.0 * _clamped", "own sweep"
+    ),
+    "sums in another order": Fault(TABLES, "columns = [0, 1, 3, 2]", "columns = [0, 1, 2, 3]", "own depths"),
+    "correlation not a mean": Fault(KERNELS, "n), LARGEST) / size", "n), LARGEST)", "correlation"),
+    "groups mixed up": Fault(KERNELS, "channel // size == group", "channel % n.features == group", "correlation"),
+    "reference's gradient without its weight": Fault(
+        GRADIENTS, "addresses, each * sampled", "addresses, sampled", "correlation"
+    ),
+    "source's gradient without the reference": Fault(
+        GRADIENTS,
+        "each = each * _reference(lattice, view",
+        "each = each + 0.0 * _reference(lattice, view",
+        "correlation",
     ),
     "depth's gradient left on its inverse": Fault(TABLES, "-along * depth.square()", "-along", "sweep"),
 }
@@ -146,16 +172,17 @@ def broken(fault: Fault | None) -> Iterator[None]:
         texts[fault.file] = texts[fault.file].replace(fault.text, fault.instead)
     names = {name: f"{name}_{next(COUNT)}" for name in texts}
     texts[GRADIENTS] = texts[GRADIENTS].replace(f"lsmgeo.kernels.triton.{KERNELS}", names[KERNELS])
-    before = launcher.kernels, operators.tables, operators.lattice_gradients
+    before = launcher.kernels, operators.tables, operators.lattice_gradients, operators.site_gradients
     with tempfile.TemporaryDirectory() as folder:
         kernels, gradients, tables = (_load(names[name], texts[name], Path(folder)) for name in texts)
         found = {"resample": kernels.resample, "resample_backward": gradients.resample_backward}
         launcher.kernels = lambda: found
         operators.tables, operators.lattice_gradients = tables.tables, tables.lattice_gradients
+        operators.site_gradients = tables.site_gradients
         try:
             yield
         finally:
-            launcher.kernels, operators.tables, operators.lattice_gradients = before
+            launcher.kernels, operators.tables, operators.lattice_gradients, operators.site_gradients = before
             for name in names.values():
                 sys.modules.pop(name)
 

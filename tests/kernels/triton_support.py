@@ -152,6 +152,20 @@ def sample_pixels(source: Tensor, given: Points, options: Options) -> tuple[Tens
     return torch.cat([saturating_cast(block, output) for block in blocks], 2), visible
 
 
+def unproject_reference(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
+    return reference.unproject(source, sites, None, options)
+
+
+def unproject(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
+    return operators.unproject(source, sites, None, options)
+
+
+def unproject_backward(
+    gradient: Tensor, source: Tensor, sites: Sites, options: Options, needs: tuple[bool, ...]
+) -> tuple[Tensor | None, ...]:
+    return operators.unproject_backward(gradient, source, sites, None, options, (*needs, False))[:-1]
+
+
 Answer = tuple[Tensor, Tensor, list[Tensor | None]]  # values, visible, gradients
 
 
@@ -192,11 +206,9 @@ def by_kernels(
         )
         return values, visible, list(back)
     values, visible = (
-        operators.plane_sweep_project(source, place, options, out)
-        if volume
-        else operators.unproject(source, place, options)
+        operators.plane_sweep_project(source, place, options, out) if volume else unproject(source, place, options)
     )
-    backward = operators.plane_sweep_project_backward if volume else operators.unproject_backward
+    backward = operators.plane_sweep_project_backward if volume else unproject_backward
     return values, visible, list(backward(values if cotangent is None else cotangent, source, place, options, needs))
 
 
@@ -221,7 +233,7 @@ def compare(
         seen: require that some sites are visible and some are not.
         out: where the kernels write a volume's values.
     """
-    operator: Any = reference.plane_sweep_project if volume else reference.unproject
+    operator: Any = reference.plane_sweep_project if volume else unproject_reference
     if not isinstance(place, Sites):
         operator = sample_pixels
     plain = options._replace(flatten=False)

@@ -354,6 +354,30 @@ FAULTS = {
         sweep_sites(lambda s: s._replace(z=s.z.detach())),
         _frustum_lattice(lambda g, lattice: lattice._replace(z=lattice.z.detach())),
     ),
+    # depths of pixels, correlation
+    "one pixel's depths for all": around(
+        lattice_geometry.site_depths, lambda inner, *a: (lambda d: d[..., :1, :1].expand_as(d))(inner(*a))
+    ),
+    "inverse depths of pixels not inverted": around(
+        lattice_geometry.site_coordinates,
+        lambda inner, sites, *a: (lambda w, z: (w, z if w is None else w * z))(*inner(sites, *a)),
+    ),
+    "depths of pixels get no gradient": around(lattice_geometry.site_depths, lambda inner, *a: inner(*a).detach()),
+    "correlation summed": around(
+        reference._correlate, lambda inner, v, r, f, groups: inner(v, r, f, groups) * (v.shape[2] // groups)
+    ),
+    "channels dealt out to groups": around(
+        reference._correlate,
+        lambda inner, v, r, f, groups: inner(
+            *(x.unflatten(x.dim() - 4, (-1, groups)).transpose(-5, -4).flatten(-5, -4) for x in (v, r)), f, groups
+        ),
+    ),
+    "reference gets no gradient": around(
+        reference._correlate, lambda inner, v, r, f, groups: inner(v, r.detach(), f, groups)
+    ),
+    "reference read behind the camera": around(
+        reference._correlate, lambda inner, v, r, f, groups: inner(v, r, torch.ones_like(f), groups)
+    ),
     # views
     "statistics count views that see nothing": _statistics(
         lambda inner, v, seen, n: inner(v, torch.ones_like(seen), n)

@@ -11,12 +11,14 @@ from hypothesis import strategies as st
 
 from tests.property import (
     test_augmentation,
+    test_correlation,
     test_frustum,
     test_gradients,
     test_grids_and_rays,
     test_hidden_sites,
     test_layout,
     test_linearity,
+    test_pixel_depths,
     test_plane_sweep,
     test_points,
     test_ray_tracing,
@@ -69,6 +71,7 @@ def _drawn(strategies: tuple[st.SearchStrategy[Any], ...]) -> tuple[tuple[Any, .
 _SCENE = scenes()
 _SWEEP = test_plane_sweep.sweeps()
 _CLOSE = scenes(placements=("facing", "inside", "grazing"))
+_FAR = scenes(placements=("facing", "grazing"))
 _TURN, _SHIFT = rotations(), vectors()
 _DTYPES = tuple((dtype,) for dtype in DTYPES)
 
@@ -133,6 +136,14 @@ LAWS = (
         test_view_statistics.test_statistics_are_the_oracles_after_augmentation,
         (_SCENE, st.just(("variance", "max", "mean")), test_view_statistics.CALLS, st.just(False)),
     ),
+    Law(
+        test_correlation.test_hidden_sites_do_not_read_the_reference, fixed=((None, "reference"), ("mean", "reference"))
+    ),
+    Law(test_correlation.test_known_numbers, fixed=(("reference",),)),
+    Law(test_correlation.test_gradients, fixed=((None, 1), ("mean", 4))),
+    Law(test_pixel_depths.test_unproject_by_the_oracle, (_FAR, st.just(("depth", "direction")), st.just(False))),
+    Law(test_pixel_depths.test_sweep_by_the_oracle, (_FAR, st.just(()))),
+    Law(test_pixel_depths.test_gradients_to_the_depths_of_pixels),
     Law(test_gradients.test_gradients_to_every_input, fixed=((0, "grid"), (0, "sweep"))),
     Law(test_layout.test_one_pixel_one_voxel_one_plane, fixed=_DTYPES),
 )

@@ -51,17 +51,18 @@ SIGNATURES = {
     cameras.unproject_depth: "(cameras, depth)",
     cameras.centers: "(cameras)",
     lsmgeo.Unproject: (
-        f"(grid=None, *, mode='bilinear', padding_mode='zeros', {SAMPLING}, reduce=None, near=1e-06, backend='auto')"
+        f"(grid=None, *, mode='bilinear', padding_mode='zeros', {SAMPLING}, reduce=None, near=1e-06, groups=1, "
+        "memory_format=None, backend='auto')"
     ),
     lsmgeo.PlaneSweepProject: (
         f"(grid=None, depths=None, size=None, *, mode='trilinear', padding_mode='zeros', {SAMPLING}, flatten=True, "
-        "near=1e-06, backend='auto')"
+        "near=1e-06, memory_format=None, backend='auto')"
     ),
-    lsmgeo.Unproject.forward: "(self, features, cameras, view_mask=None, *, grid=None)",
+    lsmgeo.Unproject.forward: "(self, features, cameras, view_mask=None, *, grid=None, reference=None)",
     lsmgeo.PlaneSweepProject.forward: "(self, volume, cameras, view_mask=None, *, grid=None, depths=None, size=None)",
     functional.unproject: (
         f"(features, cameras, grid, *, view_mask=None, mode='bilinear', padding_mode='zeros', {SAMPLING}, reduce=None, "
-        "near=1e-06, backend='auto')"
+        "near=1e-06, reference=None, groups=1, memory_format=None, backend='auto')"
     ),
     functional.unproject_points: (
         f"(features, cameras, points, *, view_mask=None, mode='bilinear', padding_mode='zeros', {SAMPLING}, "
@@ -69,7 +70,7 @@ SIGNATURES = {
     ),
     functional.plane_sweep_project: (
         "(volume, cameras, grid, depths, size=None, *, view_mask=None, mode='trilinear', padding_mode='zeros', "
-        f"{SAMPLING}, flatten=True, near=1e-06, backend='auto')"
+        f"{SAMPLING}, flatten=True, near=1e-06, memory_format=None, backend='auto')"
     ),
 }
 

@@ -4,7 +4,7 @@
 #include <cstdint>
 
 enum Kind : int64_t { UNPROJECT = 0, SAMPLE_VIEWS = 1, PLANE_SWEEP_PROJECT = 2 };
-enum Type : int64_t { FLOAT32 = 0, BFLOAT16 = 1, FLOAT16 = 2 };
+enum Type : int64_t { FLOAT32 = 0, BFLOAT16 = 1, FLOAT16 = 2, FLOAT64 = 3 };
 enum Statistic : int64_t { MEAN = 0, VARIANCE = 1, MAX = 2 };
 
 // Strides count elements. Axes of sources: scene, view, z, y, x; the channel's stride is 1. Axes of values and their
@@ -24,6 +24,10 @@ struct Call {
     const double *matrix, *direction_matrix;  // (B, V, 3, 4), or null
     const double *x, *y, *z;
     int64_t z_stride[3];           // scene, view, plane
+    const void *depths;            // of each site in place of z, or null
+    int64_t depths_type, depths_stride[5];  // FLOAT32 or FLOAT64; scene, view, z, y, x
+    const void *reference;         // to correlate the samples with, of the source's type, or null
+    int64_t reference_stride[5], groups;    // scene, channel, z, y, x; groups of channels, 0 without a reference
     const uint8_t *view_mask;      // (B, V), or null
     const float *pixels;           // (B, V, N, 2)
     const uint8_t *front;          // (B, V, N)
@@ -35,11 +39,19 @@ struct Call {
 
     const void *gradient;
     int64_t gradient_type, gradient_stride[6];
-    int64_t chunks, accumulate;    // parts of the channels; whether to add to the source's gradient
+    int64_t chunks, accumulate;    // parts of the channels; whether the source's gradient is added to what is there
+    int64_t whole_scenes;          // whether one task has all views of a scene, as their gradients meet in memory
     float *source_gradient;
     int64_t source_gradient_stride[5];
     double *matrix_gradient, *direction_gradient;  // (B, V, chunks, 3, 4), or null
     double *z_gradient;            // (B, V, chunks, D), or null
+    float *depths_gradient;        // (chunks, B, V or 1, D, H, W), or null
+    int64_t depths_gradient_stride[3];      // chunk, scene, view
+    float *reference_gradient;     // channels adjacent, cleared, or null
+    int64_t reference_gradient_stride[4];   // scene, z, y, x
     float *pixels_gradient;        // (chunks, B, V, N, 2), or null
     float *extras_gradient;        // (B, V, N, E), or null
+
+    int64_t has_invalid_depth;     // answers: whether a depth was not positive and finite, and one that was not
+    double invalid_depth;
 };

@@ -45,23 +45,36 @@ inline void load_block(const S *values, const Layout &at, int64_t sites, int64_t
             for (int64_t s = 0; s < sites; s++) block[s * channels + c] = to_float(first[s * at.site + c * at.channel]);
 }
 
-// A block of the incoming gradient: (sites, channels), `step` floats from site to site; not copied where possible.
+// Channels at the sites of a tile: (sites, channels), `step` floats from site to site; not copied where possible.
 struct Block { const float *first; int64_t step; };
 
+inline Block load_channels(const void *array, int64_t type, const Layout &at, int64_t sites, int64_t channels,
+                           float *buffer) {
+    if (type == FLOAT32) {
+        const float *values = static_cast<const float *>(array);
+        if (at.channel == 1) return {values + at.base, at.site};
+        if (at.site == 1) transpose(values + at.base, at.channel, buffer, channels, channels, sites);
+        else load_block(values, at, sites, channels, buffer);
+    } else if (type == BFLOAT16) {
+        load_block(static_cast<const Bfloat16 *>(array), at, sites, channels, buffer);
+    } else {
+        load_block(static_cast<const Float16 *>(array), at, sites, channels, buffer);
+    }
+    return {buffer, channels};
+}
+
+// A block of the incoming gradient.
 inline Block load_gradient(const Call &call, const Tile &tile, int64_t channel, int64_t channels, float *buffer) {
     Layout at = layout(call.gradient_stride, tile);
     at.base += channel * at.channel;
-    if (call.gradient_type == FLOAT32) {
-        const float *values = static_cast<const float *>(call.gradient);
-        if (at.channel == 1) return {values + at.base, at.site};
-        if (at.site == 1) transpose(values + at.base, at.channel, buffer, channels, channels, tile.count);
-        else load_block(values, at, tile.count, channels, buffer);
-    } else if (call.gradient_type == BFLOAT16) {
-        load_block(static_cast<const Bfloat16 *>(call.gradient), at, tile.count, channels, buffer);
-    } else {
-        load_block(static_cast<const Float16 *>(call.gradient), at, tile.count, channels, buffer);
-    }
-    return {buffer, channels};
+    return load_channels(call.gradient, call.gradient_type, at, tile.count, channels, buffer);
+}
+
+inline Block load_reference(const Call &call, const Tile &tile, int64_t channel, int64_t channels, float *buffer) {
+    const int64_t *stride = call.reference_stride;
+    const int64_t base = tile.scene * stride[0] + channel * stride[1] + tile.k * stride[2] + tile.j * stride[3] +
+                         tile.i * stride[4];
+    return load_channels(call.reference, call.source_type, {base, stride[4], stride[1]}, tile.count, channels, buffer);
 }
 
 inline void store_visible(const Call &call, const Tile &tile) {
@@ -102,6 +115,7 @@ inline void start_tile(const Plan &plan, Tile &tile, int64_t scene, int64_t view
     tile.k = plan.along_z ? first : row / call.sites[1];
     tile.j = plan.along_z ? row / call.sites[0] : row % call.sites[1];
     tile.i = plan.along_z ? row % call.sites[0] : first;
+    if (call.depths) load_depths(plan, tile);
 }
 
 template <class S>
@@ -126,20 +140,29 @@ inline bool misses_volume(const Call &call, const View &view, const Tile &tile) 
     if (view.masked) return true;
     if (call.border) return false;
     const int64_t last = tile.count - 1;
-    double index[3][2];
-    for (int end = 0; end < 2; end++) {
+    float range[2] = {LARGEST, 0.0f};  // of depths that differ from site to site
+    if (call.depths)
+        for (int s = 0; s <= int(last); s++) {
+            range[0] = std::min(range[0], tile.depth[s]);
+            range[1] = std::max(range[1], tile.depth[s]);
+        }
+    // The index is linear in x and in the depth: its extremes are at the corners.
+    const int corners = call.depths ? 4 : 2;
+    double least[3], most[3];
+    for (int corner = 0; corner < corners; corner++) {
+        const int end = corner & 1;
         const double x = call.x[tile.i + (tile.along_z ? 0 : end * last)], y = call.y[tile.j];
-        const double depth = 1.0 / plane_z(call, tile, tile.k + (tile.along_z ? end * last : 0));
+        const double depth =
+            call.depths ? range[corner >> 1] : 1.0 / plane_z(call, tile, tile.k + (tile.along_z ? end * last : 0));
         for (int row = 0; row < 3; row++) {
             const double *m = view.matrix[row];
-            index[row][end] = (m[0] * x + m[1] * y + m[3]) * depth + m[2];
+            const double index = (m[0] * x + m[1] * y + m[3]) * depth + m[2];
+            least[row] = corner ? std::min(least[row], index) : index;
+            most[row] = corner ? std::max(most[row], index) : index;
         }
     }
-    for (int axis = 0; axis < 3; axis++) {
-        const double high = double(call.size[axis]) + 0.01;
-        if (index[axis][0] < -1.01 && index[axis][1] < -1.01) return true;
-        if (index[axis][0] > high && index[axis][1] > high) return true;
-    }
+    for (int axis = 0; axis < 3; axis++)
+        if (most[axis] < -1.01 || least[axis] > double(call.size[axis]) + 0.01) return true;
     return false;
 }
 
@@ -159,6 +182,29 @@ inline void store_zeros(const Call &call, Tile &tile, const Layout &at) {
     }
 }
 
+template <int W> INLINE Floats<W> clamped_lanes(Floats<W> values, float largest) {
+    const Floats<W> below = values > largest ? Floats<W>{} + largest : values;
+    return below < -largest ? Floats<W>{} - largest : below;
+}
+
+// Means over groups of channels of reference times sample, one for each group. Products saturate.
+inline void correlate(const Call &call, const float *sampled, const float *reference, float *out) {
+    const int64_t size = call.channels / call.groups;
+    const float share = 1.0f / float(size);
+    for (int64_t group = 0; group < call.groups; group++) {
+        const float *a = sampled + group * size, *b = reference + group * size;
+        Floats<LANES> wide = {};
+        float sum = 0.0f;
+        over_channels(size, [&](auto width, int64_t c) INLINED {
+            constexpr int W = decltype(width)::value;
+            const Floats<W> part = clamped_lanes<W>(load<W>(a + c) * load<W>(b + c), LARGEST) * share;
+            if constexpr (W == LANES) wide += part;
+            else sum += horizontal_sum(part);
+        });
+        out[group] = clamped(sum + horizontal_sum(wide), LARGEST);
+    }
+}
+
 // Forward without statistics: tiles first to last of one view.
 template <int DIMS, class S>
 void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_t last, Workspace &workspace) {
@@ -170,7 +216,7 @@ void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_
     const int64_t channels = plan.channels;
     const OneChannelImage image = one_channel_image(call, axes);
     // Of an image: without any, the only one may be geometric.
-    const bool one_channel = DIMS == 2 && call.channels == 1 && channels == 1 && image.fits;
+    const bool one_channel = DIMS == 2 && call.channels == 1 && channels == 1 && image.fits && !call.groups;
     for (int64_t number = first; number < last; number++) {
         start_tile(plan, tile, scene, view, number);
         const Layout at = layout(call.values_stride, tile);
@@ -188,9 +234,17 @@ void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_
             if (!in_place) store_tile(call, at, tile.count, channels, workspace.values);
             continue;
         }
+        Block reference = {};
+        if (call.groups) reference = load_reference(call, tile, 0, call.channels, workspace.reference);
         for (int s = 0; s < int(tile.count); s++) {
-            gather<DIMS>(call, tile, s, source, axes, call.channels, out + s * step);
-            append_extra(call, tile, s, out + s * step + call.channels);
+            float *to = out + s * step;
+            if (!call.groups) gather<DIMS>(call, tile, s, source, axes, call.channels, to);
+            else if (!tile.front[s]) std::memset(to, 0, size_t(plan.features) * sizeof(float));
+            else {
+                gather<DIMS>(call, tile, s, source, axes, call.channels, workspace.sampled);
+                correlate(call, workspace.sampled, reference.first + s * reference.step, to);
+            }
+            append_extra(call, tile, s, to + plan.features);
         }
         if (!in_place) store_tile(call, at, tile.count, channels, workspace.values);
     }
@@ -201,28 +255,25 @@ void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_
 // The values of the views that see site s, one after another in workspace.values; returns their number.
 template <class S>
 inline int64_t gather_visible(const Plan &plan, const Tile *tiles, int s, int64_t channel, int64_t channels,
-                              bool geometry, Workspace &workspace) {
+                              bool geometry, const float *reference, Workspace &workspace) {
     const Call &call = *plan.call;
-    const int64_t step = channels + (geometry ? plan.channels - call.channels : 0);
+    const int64_t features = reference ? plan.features : channels;
+    const int64_t step = features + (geometry ? plan.channels - plan.features : 0);
     int64_t axes[3], count = 0;
     axis_strides(call.source_stride, axes);
     for (int64_t v = 0; v < call.views; v++) {
         if (!tiles[v].visible[s]) continue;
         float *out = workspace.values + count * step;
         const S *source = source_pointer<S>(call, tiles[v].scene, v) + channel;
-        gather<2>(call, tiles[v], s, source, axes, channels, out);
-        if (geometry) append_extra(call, tiles[v], s, out + channels);
+        gather<2>(call, tiles[v], s, source, axes, channels, reference ? workspace.sampled : out);
+        if (reference) correlate(call, workspace.sampled, reference, out);
+        if (geometry) append_extra(call, tiles[v], s, out + features);
         workspace.visible_views[count++] = v;
     }
     return count;
 }
 
 constexpr float LARGEST_ROOT = 0x1.fffffep63f;  // the square root of the largest float
-
-template <int W> INLINE Floats<W> clamped_lanes(Floats<W> values, float largest) {
-    const Floats<W> below = values > largest ? Floats<W>{} + largest : values;
-    return below < -largest ? Floats<W>{} - largest : below;
-}
 
 template <int W> INLINE Floats<W> mean_of(const float *values, int64_t count, int64_t step) {
     const float share = 1.0f / float(count);
@@ -288,7 +339,7 @@ void reduce(const Plan &plan, int64_t scene, int64_t first, int64_t last, Worksp
     const Call &call = *plan.call;
     Tile *tiles = static_cast<Tile *>(workspace.tiles);
     const int64_t channels = plan.channels, total = call.statistics * channels;
-    const bool only_mean = call.statistics == 1 && call.statistic[0] == MEAN && channels == call.channels;
+    const bool only_mean = call.statistics == 1 && call.statistic[0] == MEAN && channels == plan.features;
     int64_t axes[3];
     axis_strides(call.source_stride, axes);
     for (int64_t number = first; number < last; number++) {
@@ -299,23 +350,28 @@ void reduce(const Plan &plan, int64_t scene, int64_t first, int64_t last, Worksp
         }
         const Layout at = layout(call.values_stride, tiles[0]);
         const bool in_place = call.values_type == FLOAT32 && at.channel == 1;
+        Block references = {};
+        if (call.groups) references = load_reference(call, tiles[0], 0, call.channels, workspace.reference);
         for (int s = 0; s < int(tiles[0].count); s++) {
+            const float *reference = call.groups ? references.first + s * references.step : nullptr;
             float *out = in_place ? static_cast<float *>(call.values) + at.base + s * at.site
                                   : workspace.reduced + s * total;
             if (only_mean) {
                 int64_t count = 0;
                 for (int64_t v = 0; v < call.views; v++) count += tiles[v].visible[s];
+                float *mean = reference ? workspace.sampled : out;
                 bool add = false;
                 for (int64_t v = 0; v < call.views; v++) {
                     if (!tiles[v].visible[s]) continue;
                     const S *source = source_pointer<S>(call, scene, v);
-                    gather<2>(call, tiles[v], s, source, axes, channels, out, 1.0f / float(count), add);
+                    gather<2>(call, tiles[v], s, source, axes, call.channels, mean, 1.0f / float(count), add);
                     add = true;
                 }
                 if (!add) std::memset(out, 0, size_t(channels) * sizeof(float));
+                else if (reference) correlate(call, mean, reference, out);  // that of the mean is the mean of those
                 continue;
             }
-            const int64_t count = gather_visible<S>(plan, tiles, s, 0, call.channels, true, workspace);
+            const int64_t count = gather_visible<S>(plan, tiles, s, 0, call.channels, true, reference, workspace);
             statistics(call, workspace.values, count, channels, out);
         }
         if (!in_place) store_tile(call, at, tiles[0].count, total, workspace.reduced);

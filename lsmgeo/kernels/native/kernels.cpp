@@ -47,9 +47,14 @@ struct View {
     bool masked;
 };
 
+// A depth that is not positive and finite, if one was found.
+struct InvalidDepth { std::atomic<bool> found{false}; double depth = 0.0; };
+
 struct Plan {
     const Call *call;
     const View *views;       // (B, V)
+    InvalidDepth *invalid;
+    int64_t features;        // channels of a view's values: those of the source, or groups of them correlated
     int64_t channels;        // of a view's values, with the geometric ones
     int64_t tiles, tiles_per_row, blocks;
     bool along_z, backward;
@@ -61,6 +66,7 @@ struct TileSizes { int64_t tile, site_gradients, length; };  // bytes, bytes, si
 struct Workspace {
     void *tiles, *site_gradients;
     float *values, *reduced, *value_gradients, *zeros;
+    float *reference, *sampled, *row;  // of a tile; of one site: the source's channels, and their gradient
     int64_t *visible_views;
 };
 
@@ -143,8 +149,11 @@ double max_abs(const double *values, int64_t count, int64_t stride = 1) {
 void prepare_view(const Call &call, int64_t scene, int64_t number, double reach_x, double reach_y, View &view) {
     const int64_t at = scene * call.views + number;
     view.masked = call.view_mask && !call.view_mask[at];
-    const double *z = call.z + scene * call.z_stride[0] + number * call.z_stride[1];
-    const double reach_z = max_abs(z, call.sites[2], call.z_stride[2]);
+    double reach_z = 1.0;  // homogeneous, see `load_depths`
+    if (!call.depths) {
+        const double *z = call.z + scene * call.z_stride[0] + number * call.z_stride[1];
+        reach_z = max_abs(z, call.sites[2], call.z_stride[2]);
+    }
     auto bound = [](const double *matrix, double *columns) {
         for (int column = 0; column < 4; column++) columns[column] = max_abs(matrix + column, 3, 4);
     };
@@ -169,11 +178,14 @@ void prepare_view(const Call &call, int64_t scene, int64_t number, double reach_
 }
 
 // Run a call; nonzero when memory ran out.
-int run(const Call &call, bool backward) {
+int run(Call &call, bool backward) {
     Plan plan = {};
+    InvalidDepth invalid;
+    plan.invalid = &invalid;
     plan.call = &call;
     plan.backward = backward;
-    plan.channels = call.channels + call.depth + 3 * call.direction + call.extra;
+    plan.features = call.groups ? call.groups : call.channels;
+    plan.channels = plan.features + call.depth + 3 * call.direction + call.extra;
     // Tiles run along z where neighbours in z are adjacent in memory.
     const int64_t *stride = backward ? call.gradient_stride : call.values_stride;
     plan.along_z = call.kind == PLANE_SWEEP_PROJECT && call.sites[2] > 1 && stride[3] != 0 && stride[3] < stride[5];
@@ -183,9 +195,10 @@ int run(const Call &call, bool backward) {
     plan.tiles_per_row = (length + chosen.sizes.length - 1) / chosen.sizes.length;
     plan.tiles = sites / length * plan.tiles_per_row;
     // A few thousand sites for each task, fewer where each costs more.
-    const int64_t work = 1 + sites * (plan.channels + 16) * (call.statistics ? call.views : 1) / 131072;
+    const int64_t cost = std::max(plan.channels, call.channels) + 16;
+    const int64_t work = 1 + sites * cost * (call.statistics ? call.views : 1) / 131072;
     plan.blocks = std::min(plan.tiles, work);
-    const bool whole_scenes = call.statistics || (backward && call.kind == PLANE_SWEEP_PROJECT);
+    const bool whole_scenes = call.statistics || (backward && call.whole_scenes);
     const int64_t parts = call.scenes * (whole_scenes ? 1 : call.views);
     const int64_t tasks = parts * (backward ? call.chunks : plan.blocks);
 
@@ -202,8 +215,10 @@ int run(const Call &call, bool backward) {
     const int64_t tiles = call.statistics ? call.views : 1;
     const int64_t statistics = std::max<int64_t>(call.statistics, 1);
     const int64_t value_floats = std::max(chosen.sizes.length, call.statistics ? call.views : 0) * plan.channels;
-    const int64_t floats = 2 * value_floats + statistics * chosen.sizes.length * plan.channels + plan.channels;
-    const int64_t bytes = tiles * (chosen.sizes.tile + chosen.sizes.site_gradients) + 4 * floats + 8 * call.views + 256;
+    const int64_t of_reference = call.groups ? call.channels : 0;
+    const int64_t floats = 2 * value_floats + statistics * chosen.sizes.length * plan.channels + plan.channels +
+                           (chosen.sizes.length + 2) * of_reference;
+    const int64_t bytes = tiles * (chosen.sizes.tile + chosen.sizes.site_gradients) + 4 * floats + 8 * call.views + 512;
     // Each thread starts with its own part and then helps the others: two threads next to each other would fault in,
     // and clear, the same fresh pages.
     const int64_t threads = std::max<int64_t>(1, std::min(call.threads, tasks));
@@ -229,6 +244,9 @@ int run(const Call &call, bool backward) {
         workspace.value_gradients = reinterpret_cast<float *>(reserve(4 * value_floats));
         workspace.reduced = reinterpret_cast<float *>(reserve(4 * statistics * chosen.sizes.length * plan.channels));
         workspace.zeros = reinterpret_cast<float *>(reserve(4 * plan.channels));
+        workspace.reference = reinterpret_cast<float *>(reserve(4 * chosen.sizes.length * of_reference));
+        workspace.sampled = reinterpret_cast<float *>(reserve(4 * of_reference));
+        workspace.row = reinterpret_cast<float *>(reserve(4 * of_reference));
         std::fill(workspace.zeros, workspace.zeros + plan.channels, 0.0f);
         const int64_t own = arrived++;
         for (int64_t offset = 0; offset < threads; offset++) {
@@ -238,14 +256,16 @@ int run(const Call &call, bool backward) {
         }
     };
     run_on_threads(threads, body);
+    call.has_invalid_depth = invalid.found.load();
+    call.invalid_depth = invalid.depth;
     return arrived.load() == 0 ? 1 : 0;  // one thread with memory does all the work
 }
 
 }  // namespace
 
-EXPORT int lsmgeo_forward(const Call *call) { return run(*call, false); }
+EXPORT int lsmgeo_forward(Call *call) { return run(*call, false); }
 
-EXPORT int lsmgeo_backward(const Call *call) { return run(*call, true); }
+EXPORT int lsmgeo_backward(Call *call) { return run(*call, true); }
 
 EXPORT int64_t lsmgeo_size_of_call() { return int64_t(sizeof(Call)); }
 

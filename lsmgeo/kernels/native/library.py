@@ -18,10 +18,12 @@ from torch import Tensor
 
 from lsmgeo._dtypes import saturating_cast
 from lsmgeo._torch_compat import as_constant
-from lsmgeo.kernels.request import Options, Sites
+from lsmgeo.kernels.lattice_geometry import per_view
+from lsmgeo.kernels.request import Options, Sites, invalid_depth
 
 UNPROJECT, SAMPLE_VIEWS, PLANE_SWEEP_PROJECT = range(3)
-TYPES = {torch.float32: 0, torch.bfloat16: 1, torch.float16: 2}
+TYPES = {torch.float32: 0, torch.bfloat16: 1, torch.float16: 2, torch.float64: 3}
+SOURCE_TYPES = (torch.float32, torch.bfloat16, torch.float16)
 STATISTICS = {"mean": 0, "variance": 1, "max": 2}
 HUGE = 4 << 20  # bytes from which an output is allocated in huge pages
 LEAST_CHUNK = 8  # channels of a task
@@ -45,6 +47,12 @@ class _Call(ctypes.Structure):
         ("source_stride", 5 * _INTEGER),
         *((name, _ADDRESS) for name in ("matrix", "direction_matrix", "x", "y", "z")),
         ("z_stride", 3 * _INTEGER),
+        ("depths", _ADDRESS),
+        ("depths_type", _INTEGER),
+        ("depths_stride", 5 * _INTEGER),
+        ("reference", _ADDRESS),
+        ("reference_stride", 5 * _INTEGER),
+        ("groups", _INTEGER),
         *((name, _ADDRESS) for name in ("view_mask", "pixels", "front", "extras")),
         ("values", _ADDRESS),
         ("values_type", _INTEGER),
@@ -55,10 +63,17 @@ class _Call(ctypes.Structure):
         ("gradient_stride", 6 * _INTEGER),
         ("chunks", _INTEGER),
         ("accumulate", _INTEGER),
+        ("whole_scenes", _INTEGER),
         ("source_gradient", _ADDRESS),
         ("source_gradient_stride", 5 * _INTEGER),
         *((name, _ADDRESS) for name in ("matrix_gradient", "direction_gradient", "z_gradient")),
+        ("depths_gradient", _ADDRESS),
+        ("depths_gradient_stride", 3 * _INTEGER),
+        ("reference_gradient", _ADDRESS),
+        ("reference_gradient_stride", 4 * _INTEGER),
         *((name, _ADDRESS) for name in ("pixels_gradient", "extras_gradient")),
+        ("has_invalid_depth", _INTEGER),
+        ("invalid_depth", _NUMBER),
     )
 
 
@@ -97,7 +112,7 @@ def load(path: Path) -> ctypes.CDLL | str:
 
 def why_not(operator: str, source: Tensor, options: Options) -> str | None:
     """Why the C++ kernels cannot run a call, or None."""
-    if source.dtype not in TYPES:
+    if source.dtype not in SOURCE_TYPES:
         return "float64 stays on the reference path"
     if source.device.type != "cpu":
         return f"its kernels are for CPU tensors, these are on {source.device.type}"
@@ -179,12 +194,15 @@ def _set_sites(call: _Call, sites: Sites, options: Options) -> tuple[Tensor | No
     B, V = call.scenes, call.views = sites.matrix.shape[:2]
     matrix, x, y = sites.matrix.contiguous(), sites.x.contiguous(), sites.y.contiguous()
     direction = sites.direction.expand(B, V, 3, 4).contiguous() if options.direction else None  # type: ignore[union-attr]
-    z = sites.z[:, None] if sites.z.dim() == 2 else sites.z
-    z = z.expand(B, V, z.shape[-1])
+    if sites.per_site:
+        z = sites.z.expand(B, V, *sites.z.shape[2:])
+        call.depths, call.depths_type, call.depths_stride[:] = z.data_ptr(), TYPES[z.dtype], z.stride()
+    else:
+        z = per_view(sites.z, sites.matrix)
+        call.z, call.z_stride[:] = z.data_ptr(), z.stride()
     mask = None if sites.view_mask is None else sites.view_mask.contiguous()
     call.projective, call.depth, call.direction = sites.projective, options.depth, bool(options.direction)
-    call.matrix, call.x, call.y, call.z = matrix.data_ptr(), x.data_ptr(), y.data_ptr(), z.data_ptr()
-    call.z_stride[:] = z.stride()
+    call.matrix, call.x, call.y = matrix.data_ptr(), x.data_ptr(), y.data_ptr()
     call.direction_matrix = None if direction is None else direction.data_ptr()
     call.view_mask = None if mask is None else mask.data_ptr()
     return matrix, direction, x, y, z, mask
@@ -194,7 +212,7 @@ def _set_gradient(call: _Call, gradient: Tensor, options: Options) -> None:
     """Set the incoming gradient; split the channels where there are fewer scenes and views than threads."""
     call.gradient, call.gradient_type = gradient.data_ptr(), TYPES[gradient.dtype]
     call.gradient_stride[:] = _value_strides(gradient, options)
-    units = max(1, call.scenes * (1 if call.kind == PLANE_SWEEP_PROJECT or call.statistics else call.views))
+    units = max(1, call.scenes * (1 if call.whole_scenes or call.statistics else call.views))
     chunks = min(call.channels // (2 * LEAST_CHUNK), -(-2 * call.threads // units))
     if chunks * units < call.threads:
         chunks = min(call.channels // LEAST_CHUNK, -(-call.threads // units))
@@ -218,24 +236,49 @@ def _set_source_gradient(call: _Call, source: Tensor, axis: int, into: Tensor | 
     return gradient
 
 
-def _set_geometry_gradients(call: _Call, needs: Sequence[bool]) -> list[Tensor | None]:
+def _set_geometry_gradients(call: _Call, sites: Sites, needs: Sequence[bool]) -> list[Tensor | None]:
     """Set the memory of the gradients to matrix, direction and z, a part for each chunk of channels."""
-    B, V, D = call.scenes, call.views, call.sites[2]
-    shapes = ((3, 4), (3, 4), (D,))
-    parts = [
-        torch.zeros(B, V, call.chunks, *shape, dtype=torch.float64, device="cpu") if need else None
-        for shape, need in zip(shapes, needs, strict=True)
-    ]
-    call.matrix_gradient, call.direction_gradient, call.z_gradient = (
-        None if part is None else part.data_ptr() for part in parts
+    views, chunks = (call.scenes, call.views), call.chunks
+    matrix, direction = (
+        torch.zeros(*views, chunks, 3, 4, dtype=torch.float64, device="cpu") if need else None for need in needs[:2]
     )
-    return parts
+    call.matrix_gradient, call.direction_gradient = (
+        None if part is None else part.data_ptr() for part in (matrix, direction)
+    )
+    z = None
+    if needs[2] and sites.per_site:
+        z = torch.zeros(chunks, *sites.z.shape, dtype=torch.float32, device="cpu")
+        chunk, scene, view, *_ = z.stride()
+        call.depths_gradient = z.data_ptr()
+        call.depths_gradient_stride[:] = (chunk, scene, view if sites.z.shape[1] > 1 else 0)
+        z = z.movedim(0, 2)
+    elif needs[2]:
+        z = torch.zeros(*views, chunks, call.sites[2], dtype=torch.float64, device="cpu")
+        call.z_gradient = z.data_ptr()
+    return [matrix, direction, z]
+
+
+def _set_reference(call: _Call, reference: Tensor, options: Options) -> None:
+    # An empty tensor is at address 0, which nothing is read from, but which arithmetic must not start from.
+    call.groups, call.reference = options.groups, reference.data_ptr() or ctypes.addressof(call)
+    strides = reference.stride()
+    call.reference_stride[:] = (*strides[:2], strides[2] if reference.shape[2] > 1 else 0, *strides[3:])
+
+
+def _set_reference_gradient(call: _Call, reference: Tensor) -> Tensor:
+    """Where the gradient to the reference goes, in float32."""
+    B, C, *sizes = reference.shape
+    gradient = torch.zeros((B, *sizes, C), dtype=torch.float32, device="cpu")
+    scene, z, y, x, _ = gradient.stride()
+    call.reference_gradient = gradient.data_ptr()
+    call.reference_gradient_stride[:] = (scene, z if reference.shape[2] > 1 else 0, y, x)
+    return gradient.movedim(-1, 1)
 
 
 def _lattice_call(kind: int, source: Tensor, sites: Sites, options: Options) -> tuple[_Call, tuple[Tensor | None, ...]]:
     """A call on the sites of a lattice, and what must live as long as it."""
     source = channels_last(source, _channel_axis(kind))
-    call = _new_call(kind, source, options, (sites.x.shape[0], sites.y.shape[0], sites.z.shape[-1]))
+    call = _new_call(kind, source, options, sites.counts()[::-1])
     return call, (source, *_set_sites(call, sites, options))
 
 
@@ -250,17 +293,29 @@ def _lattice_backward(
     sites: Sites,
     options: Options,
     needs: Sequence[bool],
-    into: Tensor | None,
-) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+    reference: Tensor | None = None,
+    into: Tensor | None = None,
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+    """Gradients to source, matrix, direction, z and reference."""
     call, alive = _lattice_call(kind, source, sites, options)
+    of_source, of_matrix, of_direction, of_z, of_reference = needs
+    # One task has all views of a scene where their gradients are added to one array.
+    shares_depths = of_z and sites.per_site and sites.z.shape[1] < call.views
+    call.whole_scenes = kind == PLANE_SWEEP_PROJECT or of_reference or shares_depths
+    to_reference = None
+    if reference is not None:
+        _set_reference(call, reference, options)
+        to_reference = _set_reference_gradient(call, reference) if of_reference else None
     _set_gradient(call, gradient, options)
-    to_source = _set_source_gradient(call, source, _channel_axis(kind), into) if needs[0] else None
-    parts = _set_geometry_gradients(call, (needs[1], needs[2] and bool(options.direction), needs[3]))
+    to_source = _set_source_gradient(call, source, _channel_axis(kind), into) if of_source else None
+    parts = _set_geometry_gradients(call, sites, (of_matrix, of_direction and bool(options.direction), of_z))
     _run(call, backward=True)
     del alive
     if to_source is not None and into is None:
         to_source = saturating_cast(to_source, source.dtype)
-    return to_source, *(None if part is None else part.sum(2) for part in parts)  # type: ignore[return-value]
+    if to_reference is not None:
+        to_reference = saturating_cast(to_reference, source.dtype)
+    return to_source, *(None if part is None else part.sum(2) for part in parts), to_reference  # type: ignore[return-value]
 
 
 def _forward(
@@ -268,16 +323,22 @@ def _forward(
 ) -> tuple[Tensor, Tensor]:
     """Run a call forward; `alive` must live as long as it. `out` is memory of the values' shape to write to."""
     counts, reduced = call.sites[::-1], bool(options.reduce)
-    channels = (call.channels + call.depth + 3 * call.direction + call.extra) * max(1, len(options.reduce))
+    features = call.groups or call.channels
+    channels = (features + call.depth + 3 * call.direction + call.extra) * max(1, len(options.reduce))
     views = () if reduced else (call.views,)
     if out is None:
-        order = (0, 2, 3, 4, 1) if reduced else (0, 1, 4, 5, 2, 3) if options.flatten else (0, 1, 3, 4, 5, 2)
+        order = [0, 2, 3, 4, 1] if reduced else [0, 1, 4, 5, 2, 3] if options.flatten else [0, 1, 3, 4, 5, 2]
+        order = sorted(order) if options.contiguous else order
         out = empty((call.scenes, *views, channels, *counts), dtype, order)
     visible = torch.empty((call.scenes, call.views, *counts), dtype=torch.bool, device="cpu")
     call.values, call.values_type, call.visible = out.data_ptr(), TYPES[out.dtype], visible.data_ptr()
     call.values_stride[:] = _value_strides(out, options)
     _run(call, backward=False)
     del alive
+    if call.has_invalid_depth:
+        raise invalid_depth(
+            "plane_sweep_project" if call.kind == PLANE_SWEEP_PROJECT else "unproject", call.invalid_depth
+        )
     return out, visible
 
 
@@ -287,25 +348,32 @@ def _value_strides(values: Tensor, options: Options) -> tuple[int, ...]:
     return (strides[0], 0, *strides[1:]) if options.reduce else strides
 
 
-def unproject(source: Tensor, sites: Sites, options: Options, out: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def unproject(
+    source: Tensor, sites: Sites, reference: Tensor | None, options: Options, out: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """As `reference.unproject`; `out` is memory of the values' shape to write to."""
-    return _forward(*_lattice_call(UNPROJECT, source, sites, options), source.dtype, options, out)
+    call, alive = _lattice_call(UNPROJECT, source, sites, options)
+    if reference is not None:
+        _set_reference(call, reference, options)
+    return _forward(call, (*alive, reference), source.dtype, options, out)
 
 
 def unproject_backward(
     gradient: Tensor,
     source: Tensor,
     sites: Sites,
+    reference: Tensor | None,
     options: Options,
     needs: Sequence[bool],
     into: Tensor | None = None,
-) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """Vector-Jacobian product of `unproject` to source, matrix, direction and z, None where not in `needs`.
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+    """Vector-Jacobian product of `unproject` to source, matrix, direction, z and reference, None where not in `needs`.
 
-    The gradient may have any strides. That to the source has its dtype; those to matrices (B, V, 3, 4) and z (B, V, D)
-    are float64. `into` is float32 memory of the source's shape, channels adjacent, to add its gradient to.
+    The gradient may have any strides. Those to source and reference have their dtype; those to matrices (B, V, 3, 4)
+    and z (B, V, D) are float64; that to the depths of each site is float32, of their shape.
+    `into` is float32 memory of the source's shape, channels adjacent, to add its gradient to.
     """
-    return _lattice_backward(UNPROJECT, gradient, source, sites, options, needs, into)
+    return _lattice_backward(UNPROJECT, gradient, source, sites, options, needs, reference, into)
 
 
 def sample_views(
@@ -373,5 +441,8 @@ def plane_sweep_project_backward(
     needs: Sequence[bool],
     into: Tensor | None = None,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """Vector-Jacobian product of `plane_sweep_project`, as `unproject_backward`."""
-    return _lattice_backward(PLANE_SWEEP_PROJECT, gradient, source, sites, options, needs, into)
+    """Vector-Jacobian product of `plane_sweep_project` to source, matrix, direction and z, see `unproject_backward`.
+
+    `into` is float32 memory of the source's shape, channels next to one another, to add its gradient to.
+    """
+    return _lattice_backward(PLANE_SWEEP_PROJECT, gradient, source, sites, options, (*needs, False), into=into)[:-1]

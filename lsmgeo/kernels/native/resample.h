@@ -31,6 +31,8 @@ void task(const Plan &plan, int64_t number, Workspace &workspace) {
         const int64_t channel = chunk * call.channels / call.chunks;
         clear_source_gradient(call, rest, 0, channel, (chunk + 1) * call.channels / call.chunks - channel);
         for (int64_t v = 0; v < call.views; v++) sample_backward<3, S>(plan, rest, v, chunk, workspace);
+    } else if (call.whole_scenes) {
+        for (int64_t v = 0; v < call.views; v++) sample_backward<2, S>(plan, rest, v, chunk, workspace);
     } else {
         sample_backward<2, S>(plan, rest / call.views, rest % call.views, chunk, workspace);
     }

@@ -7,6 +7,7 @@ struct Tile {
     int64_t k, j, i;                // of the first site
     bool along_z;                   // whether the others follow in z, else in x
     float x[TILE], depth[TILE];     // of the lattice; depth is 1 / z
+    float w[TILE], z[TILE];         // where depths differ from site to site: q = (w x, w y, z, w)
     float index[3][TILE];
     float inverse[TILE];            // images: 1 / (M q)_3 where in front
     float plane[3][TILE];           // volumes: the terms of M q in x, y and 1
@@ -22,6 +23,41 @@ inline double plane_z(const Call &call, const Tile &tile, int64_t k) {
     return call.z[tile.scene * call.z_stride[0] + tile.view * call.z_stride[1] + k * call.z_stride[2]];
 }
 
+// The depths of the sites, where each has its own; the first that is not positive and finite is reported. Of homogeneous
+// q = (x, y, 1 / depth, 1) the multiple with w = min(depth, 1) is taken: nothing overflows, whatever the depth is.
+inline void load_depths(const Plan &plan, Tile &tile) {
+    const Call &call = *plan.call;
+    const int n = int(tile.count);
+    const int64_t *stride = call.depths_stride, step = tile.along_z ? stride[2] : stride[4];
+    const int64_t first = tile.scene * stride[0] + tile.view * stride[1] + tile.k * stride[2] + tile.j * stride[3] +
+                          tile.i * stride[4];
+    if (plan.views[tile.scene * call.views + tile.view].masked) {
+        for (int s = 0; s < n; s++) tile.depth[s] = 1.0f;
+    } else if (call.depths_type == FLOAT32) {
+        const float *depths = static_cast<const float *>(call.depths) + first;
+        for (int s = 0; s < n; s++) tile.depth[s] = depths[s * step];
+    } else {
+        const double *depths = static_cast<const double *>(call.depths) + first;
+        for (int s = 0; s < n; s++) {
+            const double depth = depths[s * step];
+            const bool tiny = depth > 0.0 && depth < SMALLEST, huge = depth > LARGEST && std::isfinite(depth);
+            tile.depth[s] = tiny ? SMALLEST : huge ? LARGEST : float(depth);
+        }
+    }
+    int32_t bad = 0;
+    for (int s = 0; s < n; s++) bad |= int32_t(!(tile.depth[s] > 0.0f && tile.depth[s] <= LARGEST));
+    if (bad)
+        for (int s = 0; s < n; s++) {
+            if (tile.depth[s] > 0.0f && tile.depth[s] <= LARGEST) continue;
+            if (!plan.invalid->found.exchange(true)) plan.invalid->depth = tile.depth[s];
+            tile.depth[s] = 1.0f;
+        }
+    for (int s = 0; s < n; s++) {
+        tile.w[s] = tile.depth[s] < 1.0f ? tile.depth[s] : 1.0f;
+        tile.z[s] = tile.w[s] / tile.depth[s];
+    }
+}
+
 // Directions G q / |G q|, and 0 where the vector is no longer than the rounding error of its terms.
 inline void ray_directions(const Call &call, const View &view, Tile &tile) {
     const int n = int(tile.count);
@@ -29,7 +65,10 @@ inline void ray_directions(const Call &call, const View &view, Tile &tile) {
     float vector[3][TILE], least[TILE];
     for (int row = 0; row < 3; row++) {
         const double *g = view.direction[row];
-        if (tile.along_z) {
+        if (call.depths) {
+            const float slope = float(g[0]), base = float(g[1] * y + g[3]), inner = float(g[2]);
+            for (int s = 0; s < n; s++) vector[row][s] = (slope * tile.x[s] + base) * tile.w[s] + inner * tile.z[s];
+        } else if (tile.along_z) {
             const float base = float(g[0] * call.x[tile.i] + g[1] * y + g[3]);
             for (int s = 0; s < n; s++) vector[row][s] = float(g[2] * plane_z(call, tile, tile.k + s)) + base;
         } else {
@@ -38,8 +77,9 @@ inline void ray_directions(const Call &call, const View &view, Tile &tile) {
         }
     }
     for (int s = 0; s < n; s++) {
-        const double z = plane_z(call, tile, tile.k + (tile.along_z ? s : 0));
-        const float terms = 4.0f * 0x1p-23f * float(view.terms + view.terms_z * std::fabs(z));
+        const double w = call.depths ? tile.w[s] : 1.0;
+        const double z = call.depths ? tile.z[s] : plane_z(call, tile, tile.k + (tile.along_z ? s : 0));
+        const float terms = 4.0f * 0x1p-23f * float(view.terms * w + view.terms_z * std::fabs(z));
         least[s] = terms * terms;
     }
     for (int s = 0; s < n; s++) {
@@ -81,6 +121,35 @@ inline void project_to_pixels(const Call &call, const View &view, Tile &tile) {
     }
 }
 
+// As `project_to_pixels`, with the depth of each site.
+inline void project_depths_to_pixels(const Call &call, const View &view, Tile &tile) {
+    const int n = int(tile.count);
+    const double y = call.y[tile.j];
+    const float scale = float(view.scale), near = float(call.near) * scale;
+    float height[TILE], slope[3], base[3], inner[3];
+    for (int row = 0; row < 3; row++) {
+        const double *m = view.matrix[row];
+        slope[row] = float(m[0]);
+        base[row] = float(m[1] * y + m[3]);
+        inner[row] = float(m[2]);
+    }
+    for (int s = 0; s < n; s++) {
+        const float x = tile.x[s], w = tile.w[s], z = tile.z[s], bound = near * z;
+        height[s] = (slope[2] * x + base[2]) * w + inner[2] * z;
+        const bool front = height[s] > (bound > SMALLEST_DEPTH ? bound : SMALLEST_DEPTH) && !view.masked;
+        const float inverse = 1.0f / (front ? height[s] : 1.0f);
+        tile.front[s] = front;
+        tile.inverse[s] = front ? inverse : 0.0f;
+        tile.index[0][s] = front ? ((slope[0] * x + base[0]) * w + inner[0] * z) * inverse : OUTSIDE;
+        tile.index[1][s] = front ? ((slope[1] * x + base[1]) * w + inner[1] * z) * inverse : OUTSIDE;
+    }
+    if (call.depth)
+        for (int s = 0; s < n; s++) {
+            const double distance = view.masked ? 0.0 : double(height[s]) / (double(tile.z[s]) * scale);
+            tile.distance[s] = float(distance > LARGEST ? LARGEST : distance < -LARGEST ? -LARGEST : distance);
+        }
+}
+
 inline void load_pixels(const Call &call, Tile &tile) {
     const int64_t first = (tile.scene * call.views + tile.view) * call.sites[0] + tile.i;
     for (int s = 0; s < int(tile.count); s++) {
@@ -94,10 +163,11 @@ inline void load_pixels(const Call &call, Tile &tile) {
 inline void project_to_voxels(const Call &call, const View &view, Tile &tile) {
     const int n = int(tile.count);
     const double y = call.y[tile.j];
-    for (int s = 0; s < n; s++) {
-        const double depth = 1.0 / plane_z(call, tile, tile.k + (tile.along_z ? s : 0));
-        tile.depth[s] = float(depth > LARGEST ? LARGEST : depth);
-    }
+    if (!call.depths)
+        for (int s = 0; s < n; s++) {
+            const double depth = 1.0 / plane_z(call, tile, tile.k + (tile.along_z ? s : 0));
+            tile.depth[s] = float(depth > LARGEST ? LARGEST : depth);
+        }
     for (int s = 0; s < n; s++) tile.front[s] = tile.depth[s] > float(call.near) && !view.masked;
     for (int row = 0; row < 3; row++) {
         const double *m = view.matrix[row];
@@ -157,6 +227,7 @@ inline void locate(const Call &call, const View &view, Tile &tile) {
         for (int s = 0; s < int(tile.count); s++) tile.x[s] = float(call.x[tile.i + (tile.along_z ? 0 : s)]);
     if (DIMS == 3) project_to_voxels(call, view, tile);
     else if (call.kind == SAMPLE_VIEWS) load_pixels(call, tile);
+    else if (call.depths) project_depths_to_pixels(call, view, tile);
     else project_to_pixels(call, view, tile);
     if (call.direction) ray_directions(call, view, tile);
     interpolation_weights<DIMS>(call, tile);

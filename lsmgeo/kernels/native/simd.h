@@ -2,7 +2,7 @@
 
 constexpr int TILE = 64;
 constexpr float OUTSIDE = -2.0f;                // an index whose taps are all outside
-constexpr float LARGEST = 3.402823466e38f;
+constexpr float LARGEST = 3.402823466e38f, SMALLEST = 0x1p-126f;
 constexpr float SMALLEST_DEPTH = 0x1p-60f;
 constexpr float LARGEST_COORDINATE = 0x1p100f;
 

@@ -11,12 +11,17 @@ from lsmgeo.kernels.triton.forward import (
     _addresses,
     _cell,
     _channels,
+    _chunk,
+    _clamped_plane_row,
+    _coordinates,
     _direction,
     _extra_offsets,
     _inverse_count,
     _is_unmasked,
     _moments,
     _project,
+    _reference,
+    _sampled,
     _site,
     _tap,
     _values,
@@ -24,16 +29,18 @@ from lsmgeo.kernels.triton.forward import (
     _view_start,
 )
 from lsmgeo.kernels.triton.types import (
-    EXTRA_SUMS,
+    DEPTH_SUMS,
+    DIRECTION_FIELDS,
     EXTRAS,
     FEATURES,
     FIELDS,
     IMAGES,
-    INDEX_SUMS,
     LARGEST,
     LARGEST_DEVIATION,
     OUTSIDE,
     PIXELS,
+    ROW,
+    ROW_PER_SITE,
     UNIT,
     VOLUME,
 )
@@ -44,23 +51,43 @@ __all__ = ["resample_backward"]
 @triton.jit
 def _load_gradient(gradient, start, BLOCK: tl.constexpr, PART: tl.constexpr, site, n, CONFIG: tl.constexpr):
     _, exists, channel = _channels(PART, site, n, CONFIG)
-    channel += BLOCK * (n.channels + CONFIG.extras)
+    channel += BLOCK * (n.features + CONFIG.extras)
     mask = site.keep[:, None] & exists[None, :]
     return tl.load(_addresses(gradient, start, site.k, site.j, site.i, channel), mask=mask, other=0.0).to(tl.float32)
 
 
 @triton.jit
-def _sum_rows(sums, x_gradient, y_gradient, z_gradient, k, site, n, CONFIG: tl.constexpr):
-    """Write the sums of a row's gradient times x, y and 1 for three rows, plane by plane."""
-    _sum(sums, x_gradient * site.x, k, n, CONFIG)
-    _sum(sums + 1, x_gradient * site.y, k, n, CONFIG)
-    _sum(sums + 2, x_gradient, k, n, CONFIG)
-    _sum(sums + 3, y_gradient * site.x, k, n, CONFIG)
-    _sum(sums + 4, y_gradient * site.y, k, n, CONFIG)
-    _sum(sums + 5, y_gradient, k, n, CONFIG)
-    _sum(sums + 6, z_gradient * site.x, k, n, CONFIG)
-    _sum(sums + 7, z_gradient * site.y, k, n, CONFIG)
-    _sum(sums + 8, z_gradient, k, n, CONFIG)
+def _sum_row(sums, gradient, w, z, k, site, n, CONFIG: tl.constexpr):
+    """Write the sums of a row's gradient times x, y and 1, plane by plane; with depths of sites w x, w y, w and z."""
+    flat = gradient * w if CONFIG.per_site else gradient
+    _sum(sums, flat * site.x, k, n, CONFIG)
+    _sum(sums + 1, flat * site.y, k, n, CONFIG)
+    _sum(sums + 2, flat, k, n, CONFIG)
+    if CONFIG.per_site:
+        _sum(sums + 3, gradient * z, k, n, CONFIG)
+
+
+@triton.jit
+def _sum_rows(sums, x_gradient, y_gradient, z_gradient, w, z, k, site, n, CONFIG: tl.constexpr):
+    """`_sum_row` for three rows."""
+    STEP: tl.constexpr = ROW_PER_SITE if CONFIG.per_site else ROW
+    _sum_row(sums, x_gradient, w, z, k, site, n, CONFIG)
+    _sum_row(sums + STEP, y_gradient, w, z, k, site, n, CONFIG)
+    _sum_row(sums + 2 * STEP, z_gradient, w, z, k, site, n, CONFIG)
+
+
+@triton.jit
+def _store_depth_gradient(depth_sums, values, number, view, site, n, CONFIG: tl.constexpr):
+    """Write the gradients to the depths of the sites: those of tile `number` of the features, or of other channels."""
+    parts = n.tiles + (1 if CONFIG.extras > 0 else 0)
+    entry = ((view * parts + number) * n.planes + site.k) * (n.height * n.width) + site.pixel
+    tl.store(depth_sums + entry, values, mask=site.keep)
+
+
+@triton.jit
+def _along_z(table, x_gradient, y_gradient, z_gradient):
+    """The gradient to the z of q from those to three rows of ``M q``."""
+    return x_gradient * tl.load(table + 2) + y_gradient * tl.load(table + 6) + z_gradient * tl.load(table + 10)
 
 
 @triton.jit
@@ -79,9 +106,8 @@ def _scatter(into, scale, addresses, values, mask):
 
 
 @triton.jit
-def _feature_gradients(grad, source, into, scale, sums, view, projection, site, n, CONFIG: tl.constexpr):
-    """From a view's gradient (sites, channels) to those of the source and of the index."""
-    channel, exists, _ = _channels(FEATURES, site, n, CONFIG)
+def _tap_gradients(grad, source, into, scale, view, projection, channel, exists, n, CONFIG: tl.constexpr):
+    """From the gradient to the sampled channels (sites, channels) to those to the source and to the index."""
     cell = _cell(projection, n, CONFIG)
     grad_x = tl.zeros([CONFIG.sites], tl.float32)
     grad_y = grad_x
@@ -99,12 +125,55 @@ def _feature_gradients(grad, source, into, scale, sums, view, projection, site, 
             grad_x += product * weight_y * weight_z * (1.0 if corner % 2 else -1.0)
             grad_y += product * weight_x * weight_z * (1.0 if corner // 2 % 2 else -1.0)
             grad_z += product * weight_x * weight_y * (1.0 if corner // 4 else -1.0)
+    return grad_x * cell.slope_x, grad_y * cell.slope_y, grad_z * cell.slope_z
+
+
+@triton.jit
+def _correlation_gradients(grad, source, into, lattice, view, projection, site, n, CONFIG: tl.constexpr):
+    """From the gradient to the correlations (sites, groups) to those to source, reference and index."""
+    column, size = tl.arange(0, CONFIG.columns)[None, :], tl.maximum(n.channels // n.features, 1)
+    grad_x = tl.zeros([CONFIG.sites], tl.float32)
+    grad_y = grad_x
+    grad_z = grad_x
+    for number in range(n.chunks):
+        channel, exists = _chunk(number, n, CONFIG)
+        each = tl.zeros([CONFIG.sites, CONFIG.channels], tl.float32)
+        for group in range(n.features):
+            part = tl.sum(tl.where(column == group, grad, 0.0), 1) / size
+            each += tl.where((channel // size == group)[None, :], part[:, None], 0.0)
+        if CONFIG.needs_reference:
+            array = into.reference
+            start = (view // n.views) * array.b
+            addresses = _addresses(array, start, site.k, site.j, site.i, channel)
+            sampled = _sampled(source, view, projection, channel, exists, n, CONFIG)
+            _scatter(
+                array, into.reference_scale, addresses, each * sampled, projection.front[:, None] & exists[None, :]
+            )
+        each = each * _reference(lattice, view, projection, site, channel, exists, n)
+        x, y, z = _tap_gradients(
+            each, source, into.source, into.source_scale, view, projection, channel, exists, n, CONFIG
+        )
+        grad_x += x
+        grad_y += y
+        grad_z += z
+    return grad_x, grad_y, grad_z
+
+
+@triton.jit
+def _feature_gradients(grad, source, into, lattice, sums, view, projection, site, n, CONFIG: tl.constexpr):
+    """From a view's gradient (sites, channels) to those to the source, to the reference and to the geometry."""
+    if CONFIG.correlates:
+        grad_x, grad_y, grad_z = _correlation_gradients(grad, source, into, lattice, view, projection, site, n, CONFIG)
+    else:
+        channel, exists, _ = _channels(FEATURES, site, n, CONFIG)
+        grad_x, grad_y, grad_z = _tap_gradients(
+            grad, source, into.source, into.source_scale, view, projection, channel, exists, n, CONFIG
+        )
     if CONFIG.needs_geometry and not CONFIG.nearest:
-        grad_x, grad_y, grad_z = grad_x * cell.slope_x, grad_y * cell.slope_y, grad_z * cell.slope_z
         if CONFIG.kind == PIXELS:
             entry = ((view * n.width + site.pixel) * n.tiles + site.tile) * 2
-            tl.store(sums + entry, grad_x, mask=site.keep)
-            tl.store(sums + entry + 1, grad_y, mask=site.keep)
+            tl.store(sums.index + entry, grad_x, mask=site.keep)
+            tl.store(sums.index + entry + 1, grad_y, mask=site.keep)
         else:
             if CONFIG.kind == IMAGES:
                 # Where the index is out of range the gradient is 0, but 0 times infinity is not.
@@ -112,9 +181,21 @@ def _feature_gradients(grad, source, into, scale, sums, view, projection, site, 
                 y = tl.minimum(tl.maximum(projection.y, OUTSIDE), n.cells_y + 1.0)
                 grad_z = -(grad_x * x + grad_y * y) * projection.inverse
                 grad_x, grad_y = grad_x * projection.inverse, grad_y * projection.inverse
+            w, along, depth = _coordinates(lattice, view, site, n, CONFIG)
+            if CONFIG.per_site:
+                table = lattice.views + view * FIELDS
+                if CONFIG.kind == IMAGES:
+                    # A multiple of q is the same site: as if only z = 1 / depth followed from the depth.
+                    to_depth = -_along_z(table, grad_x, grad_y, grad_z) * tl.div_rn(along, depth)
+                else:
+                    to_depth = grad_x * _clamped_plane_row(table, site) + grad_y * _clamped_plane_row(table + 4, site)
+                    to_depth += grad_z * _clamped_plane_row(table + 8, site)
+                    w, along = depth, tl.zeros_like(depth) + 1.0
+                _store_depth_gradient(sums.depths, to_depth, site.tile, view, site, n, CONFIG)
+            STEP: tl.constexpr = ROW_PER_SITE if CONFIG.per_site else ROW
             k = site.slab * CONFIG.planes + tl.arange(0, CONFIG.planes)
             entry = ((view * n.planes + k) * n.blocks + site.block) * n.tiles + site.tile
-            _sum_rows(sums + entry * INDEX_SUMS, grad_x, grad_y, grad_z, k, site, n, CONFIG)
+            _sum_rows(sums.index + entry * 3 * STEP, grad_x, grad_y, grad_z, w, along, k, site, n, CONFIG)
 
 
 @triton.jit
@@ -126,34 +207,46 @@ def _extra_gradients(grad, lattice, points, sums, view, projection, site, n, CON
         mask = site.keep[:, None] & (column < CONFIG.extras)
         offset = _extra_offsets(points, view, site, n, CONFIG)
         values = tl.load(points.extra + offset, mask=mask, other=0.0)
-        tl.store(sums + offset, tl.where(tl.abs(values) <= LIMIT, grad, 0.0), mask=mask)
+        tl.store(sums.extra + offset, tl.where(tl.abs(values) <= LIMIT, grad, 0.0), mask=mask)
     else:
         k = site.slab * CONFIG.planes + tl.arange(0, CONFIG.planes)
-        sums += ((view * n.planes + k) * n.blocks + site.block) * EXTRA_SUMS
+        STEP: tl.constexpr = ROW_PER_SITE if CONFIG.per_site else ROW
+        table = lattice.views + view * FIELDS
+        extra = sums.extra + ((view * n.planes + k) * n.blocks + site.block) * (DEPTH_SUMS + 3 * STEP)
+        w, z, own = _coordinates(lattice, view, site, n, CONFIG)
+        to_depth = tl.zeros([CONFIG.sites], tl.float32)
         if CONFIG.depth:
             grad_depth = tl.sum(tl.where(column == 0, grad, 0.0), 1)
-            has_gradient = (tl.abs(projection.distance) <= LIMIT) & _is_unmasked(lattice.views + view * FIELDS, site)
+            has_gradient = (tl.abs(projection.distance) <= LIMIT) & _is_unmasked(table, site)
             grad_depth = tl.where(has_gradient, grad_depth, 0.0)
             if CONFIG.kind == VOLUME:
-                _sum(sums + 3, grad_depth, k, n, CONFIG)
+                to_depth = grad_depth
+                if not CONFIG.per_site:
+                    _sum(extra + 3, grad_depth, k, n, CONFIG)
             else:
-                along = tl.load(lattice.z + view * n.planes + site.k, mask=site.keep, other=1.0)
-                unit = tl.load(lattice.views + view * FIELDS + UNIT) * (along if CONFIG.projective else 1.0)
+                unit = tl.load(table + UNIT) * (z if CONFIG.projective else 1.0)
                 row = tl.div_rn(grad_depth, unit + tl.zeros_like(grad_depth))
-                _sum(sums, row * site.x, k, n, CONFIG)
-                _sum(sums + 1, row * site.y, k, n, CONFIG)
-                _sum(sums + 2, row, k, n, CONFIG)
-                _sum(sums + 3, tl.where(grad_depth != 0.0, grad_depth * projection.distance, 0.0), k, n, CONFIG)
+                through = tl.where(grad_depth != 0.0, grad_depth * projection.distance, 0.0)
+                _sum_row(extra, row, w, z, k, site, n, CONFIG)
+                if CONFIG.per_site:
+                    to_depth = tl.div_rn(through - row * tl.load(table + 10) * z, own)
+                else:
+                    _sum(extra + 3, through, k, n, CONFIG)
         if CONFIG.direction:
-            x, y, z, inverse = _direction(lattice, view, site, n, CONFIG)
+            unit_x, unit_y, unit_z, inverse = _direction(lattice, view, site, n, CONFIG)
             grad_x = tl.sum(tl.where(column == CONFIG.depth, grad, 0.0), 1)
             grad_y = tl.sum(tl.where(column == CONFIG.depth + 1, grad, 0.0), 1)
             grad_z = tl.sum(tl.where(column == CONFIG.depth + 2, grad, 0.0), 1)
-            along = grad_x * x + grad_y * y + grad_z * z
-            grad_x = (grad_x - along * x) * inverse
-            grad_y = (grad_y - along * y) * inverse
-            grad_z = (grad_z - along * z) * inverse
-            _sum_rows(sums + 4, grad_x, grad_y, grad_z, k, site, n, CONFIG)
+            along = grad_x * unit_x + grad_y * unit_y + grad_z * unit_z
+            grad_x = (grad_x - along * unit_x) * inverse
+            grad_y = (grad_y - along * unit_y) * inverse
+            grad_z = (grad_z - along * unit_z) * inverse
+            _sum_rows(extra + DEPTH_SUMS, grad_x, grad_y, grad_z, w, z, k, site, n, CONFIG)
+            if CONFIG.per_site:
+                inner = _along_z(table + DIRECTION_FIELDS, grad_x, grad_y, grad_z)
+                to_depth -= tl.div_rn(inner * z, own)
+        if CONFIG.per_site:
+            _store_depth_gradient(sums.depths, to_depth, n.tiles, view, site, n, CONFIG)
 
 
 @triton.jit
@@ -162,7 +255,6 @@ def _view_gradients(
     grad,
     source,
     into,
-    scale,
     sums,
     lattice,
     points,
@@ -173,7 +265,7 @@ def _view_gradients(
     CONFIG: tl.constexpr,
 ):
     if PART == FEATURES:
-        _feature_gradients(grad, source, into, scale, sums, view, projection, site, n, CONFIG)
+        _feature_gradients(grad, source, into, lattice, sums, view, projection, site, n, CONFIG)
     else:
         _extra_gradients(grad, lattice, points, sums, view, projection, site, n, CONFIG)
 
@@ -191,7 +283,6 @@ def _backward(
     gradient,
     source,
     into,
-    scale,
     sums,
     lattice,
     points,
@@ -224,27 +315,26 @@ def _backward(
                 deviation = _values(PART, source, lattice, points, view, projection, site, n, CONFIG) - mean
                 grad += tl.where(tl.abs(deviation) <= LARGEST_DEVIATION, 2.0 * deviation * grad_square, 0.0)
             grad = tl.where(projection.visible[:, None], grad, 0.0)
-            _view_gradients(PART, grad, source, into, scale, sums, lattice, points, view, projection, site, n, CONFIG)
+            _view_gradients(PART, grad, source, into, sums, lattice, points, view, projection, site, n, CONFIG)
     else:
         view = site.owner
         projection = _project(lattice, points, view, site, n, near, CONFIG)
         grad = _load_gradient(gradient, _view_start(gradient, view, n), 0, PART, site, n, CONFIG)
-        _view_gradients(PART, grad, source, into, scale, sums, lattice, points, view, projection, site, n, CONFIG)
+        if PART == FEATURES and CONFIG.correlates and CONFIG.largest < LARGEST:
+            values = _values(PART, source, lattice, points, view, projection, site, n, CONFIG)
+            grad = _unsaturated(grad, values, CONFIG)
+        _view_gradients(PART, grad, source, into, sums, lattice, points, view, projection, site, n, CONFIG)
 
 
 @triton.jit
-def resample_backward(
-    gradient, source, into, scale, index_sums, extra_sums, lattice, points, n, near, CONFIG: tl.constexpr
-):
+def resample_backward(gradient, source, into, sums, lattice, points, n, near, CONFIG: tl.constexpr):
     """The vector-Jacobian product of `resample`; everything else is recomputed from its inputs.
 
     Args:
         gradient: `Strided`, as `resample`'s out.
         source: `Strided`, as `resample`'s.
-        into: `Strided`, to whose elements the source's gradient is added: float32, or int64 in units of 1 / scale.
-        scale: (1,) float32, or None for float32.
-        index_sums: float32: (B V, D, blocks, tiles, INDEX_SUMS), or the pixels' gradients (B V, N, tiles, 2).
-        extra_sums: float32: (B V, D, blocks, EXTRA_SUMS), or the given channels' gradients (B V, E, N).
+        into: `Into`, what the gradients to source and reference are added to.
+        sums: `Sums`.
         lattice: as `resample`'s.
         points: as `resample`'s.
         n: `Sizes`.
@@ -256,7 +346,7 @@ def resample_backward(
         share = _inverse_count(None, lattice, points, site, n, near, CONFIG)
     else:
         share = tl.zeros([CONFIG.sites], tl.float32)
-    _backward(FEATURES, share, gradient, source, into, scale, index_sums, lattice, points, site, n, near, CONFIG)
+    _backward(FEATURES, share, gradient, source, into, sums, lattice, points, site, n, near, CONFIG)
     if CONFIG.extras > 0 and CONFIG.needs_geometry:
         if site.tile == 0:
-            _backward(EXTRAS, share, gradient, source, into, scale, extra_sums, lattice, points, site, n, near, CONFIG)
+            _backward(EXTRAS, share, gradient, source, into, sums, lattice, points, site, n, near, CONFIG)

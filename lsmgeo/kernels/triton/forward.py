@@ -37,8 +37,6 @@ from lsmgeo.kernels.triton.types import (
     Site,
 )
 
-__all__ = ["resample"]
-
 # Projection
 
 
@@ -79,15 +77,39 @@ def _plane_row(table, x, y):
 
 
 @triton.jit
-def _row(table, x, y, z):
-    return _plane_row(table, x, y) + tl.load(table + 2) * z
+def _coordinates(lattice, view, site, n, CONFIG: tl.constexpr):
+    """Coordinates w and z of ``q = (w x, w y, z, w)``, as in `lattice_geometry.site_coordinates`, and the depth."""
+    if CONFIG.per_site:
+        array = lattice.depths
+        offset = site.k.to(tl.int64) * array.z + site.j.to(tl.int64) * array.y + site.i.to(tl.int64) * array.x
+        depth = tl.load(array.pointer + _view_start(array, view, n) + offset, mask=site.keep, other=1.0)
+        depth = tl.where((depth > 0.0) & (depth <= LARGEST), depth, 1.0)
+        w = tl.minimum(depth, 1.0)
+        z = tl.div_rn(w, depth)
+    else:
+        z = tl.load(lattice.z + view * n.planes + site.k, mask=site.keep, other=1.0)
+        w = tl.zeros_like(z) + 1.0
+        depth = w
+    return w, z, depth
+
+
+@triton.jit
+def _row(table, site, w, z, CONFIG: tl.constexpr):
+    plane = _plane_row(table, site.x, site.y)
+    if CONFIG.per_site:
+        plane = plane * w
+    return plane + tl.load(table + 2) * z
+
+
+@triton.jit
+def _clamped_plane_row(table, site):
+    return tl.minimum(tl.maximum(_plane_row(table, site.x, site.y), -LARGEST_COORDINATE), LARGEST_COORDINATE)
 
 
 @triton.jit
 def _volume_index(table, site, depth, front):
     """An index into a volume: depth (M_x x + M_y y + M_1) + M_z."""
-    plane = tl.minimum(tl.maximum(_plane_row(table, site.x, site.y), -LARGEST_COORDINATE), LARGEST_COORDINATE)
-    return tl.where(front, plane * depth + tl.load(table + 2), OUTSIDE)
+    return tl.where(front, _clamped_plane_row(table, site) * depth + tl.load(table + 2), OUTSIDE)
 
 
 @triton.jit
@@ -109,7 +131,11 @@ def _project(lattice, points, view, site, n, near, CONFIG: tl.constexpr):
     elif CONFIG.kind == VOLUME:
         table = lattice.views + view * FIELDS
         unmasked = _is_unmasked(table, site)
-        distance = tl.load(lattice.depth + view * n.planes + site.k, mask=unmasked, other=0.0)
+        if CONFIG.per_site:
+            _, _, depth = _coordinates(lattice, view, site, n, CONFIG)
+            distance = tl.where(unmasked, depth, 0.0)
+        else:
+            distance = tl.load(lattice.depth + view * n.planes + site.k, mask=unmasked, other=0.0)
         front = unmasked & (distance > near)
         x = _volume_index(table, site, distance, front)
         y = _volume_index(table + 4, site, distance, front)
@@ -117,15 +143,15 @@ def _project(lattice, points, view, site, n, near, CONFIG: tl.constexpr):
     else:
         table = lattice.views + view * FIELDS
         unmasked = _is_unmasked(table, site)
-        along = tl.load(lattice.z + view * n.planes + site.k, mask=site.keep, other=1.0)
+        w, along, _ = _coordinates(lattice, view, site, n, CONFIG)
         unit = tl.load(table + UNIT) + tl.zeros_like(along)
         if CONFIG.projective:
             unit = unit * along
-        height = _row(table + 8, site.x, site.y, along)
+        height = _row(table + 8, site, w, along, CONFIG)
         front = unmasked & (height > tl.maximum(near * unit, SMALLEST_DEPTH))
         inverse = tl.div_rn(1.0 + tl.zeros_like(height), tl.where(front, height, 1.0))
-        x = tl.where(front, _row(table, site.x, site.y, along) * inverse, OUTSIDE)
-        y = tl.where(front, _row(table + 4, site.x, site.y, along) * inverse, OUTSIDE)
+        x = tl.where(front, _row(table, site, w, along, CONFIG) * inverse, OUTSIDE)
+        y = tl.where(front, _row(table + 4, site, w, along, CONFIG) * inverse, OUTSIDE)
         distance = tl.where(unmasked, tl.div_rn(height, unit), 0.0)
     visible = front & _inside(x, n.cells_x) & _inside(y, n.cells_y)
     if CONFIG.kind == VOLUME:
@@ -138,12 +164,12 @@ def _direction(lattice, view, site, n, CONFIG: tl.constexpr):
     """The unit vector to the sites, and its inverse length; all 0 in the camera centre and for masked views."""
     table = lattice.views + view * FIELDS
     unmasked = _is_unmasked(table, site)
-    along = tl.load(lattice.z + view * n.planes + site.k, mask=site.keep, other=1.0)
-    x = _row(table + DIRECTION_FIELDS, site.x, site.y, along)
-    y = _row(table + DIRECTION_FIELDS + 4, site.x, site.y, along)
-    z = _row(table + DIRECTION_FIELDS + 8, site.x, site.y, along)
+    w, along, _ = _coordinates(lattice, view, site, n, CONFIG)
+    x = _row(table + DIRECTION_FIELDS, site, w, along, CONFIG)
+    y = _row(table + DIRECTION_FIELDS + 4, site, w, along, CONFIG)
+    z = _row(table + DIRECTION_FIELDS + 8, site, w, along, CONFIG)
     squares = x * x + y * y + z * z
-    shortest = FOUR_EPS * (tl.load(table + TERMS) + tl.load(table + TERMS + 1) * tl.abs(along))
+    shortest = FOUR_EPS * (tl.load(table + TERMS) * w + tl.load(table + TERMS + 1) * tl.abs(along))
     away = unmasked & (squares > shortest * shortest)
     inverse = tl.where(away, tl.rsqrt(tl.where(away, squares, 1.0)), 0.0)
     return tl.where(away, x * inverse, 0.0), tl.where(away, y * inverse, 0.0), tl.where(away, z * inverse, 0.0), inverse
@@ -209,12 +235,15 @@ def _addresses(array, start, z, y, x, channel):
 @triton.jit
 def _channels(PART: tl.constexpr, site, n, CONFIG: tl.constexpr):
     """The channels of a tile, which of them exist, and their indices among the output's."""
-    if PART == FEATURES:
+    if PART == FEATURES and CONFIG.correlates:
+        channel = tl.arange(0, CONFIG.columns)
+        return channel, channel < n.features, channel
+    elif PART == FEATURES:
         channel = site.tile * CONFIG.channels + tl.arange(0, CONFIG.channels)
         return channel, channel < n.channels, channel
     else:
         channel = tl.arange(0, CONFIG.width)
-        return channel, channel < CONFIG.extras, n.channels + channel
+        return channel, channel < CONFIG.extras, n.features + channel
 
 
 @triton.jit
@@ -231,20 +260,57 @@ def _extra_offsets(points, view, site, n, CONFIG: tl.constexpr):
 
 
 @triton.jit
+def _sampled(source, view, projection, channel, exists, n, CONFIG: tl.constexpr):
+    """The interpolated channels (sites, channels)."""
+    cell = _cell(projection, n, CONFIG)
+    start = _view_start(source, view, n)
+    values = tl.zeros([CONFIG.sites, CONFIG.channels], tl.float32)
+    for corner in tl.static_range(CONFIG.corners):
+        x, y, z, weight_x, weight_y, weight_z, inside = _tap(cell, n, corner, CONFIG)
+        # Sites not in front read nothing, so that a NaN in the features does no harm.
+        mask = (projection.front & inside)[:, None] & exists[None, :]
+        value = tl.load(_addresses(source, start, z, y, x, channel), mask=mask, other=0.0).to(tl.float32)
+        values += value * (weight_x * weight_y * weight_z)[:, None]
+    return values
+
+
+@triton.jit
+def _reference(lattice, view, projection, site, channel, exists, n):
+    """The reference's channels (sites, channels) at the sites in front."""
+    start, mask = (view // n.views) * lattice.reference.b, projection.front[:, None] & exists[None, :]
+    addresses = _addresses(lattice.reference, start, site.k, site.j, site.i, channel)
+    return tl.load(addresses, mask=mask, other=0.0).to(tl.float32)
+
+
+@triton.jit
+def _chunk(number, n, CONFIG: tl.constexpr):
+    channel = number * CONFIG.channels + tl.arange(0, CONFIG.channels)
+    return channel, channel < n.channels
+
+
+@triton.jit
+def _correlations(source, lattice, view, projection, site, n, CONFIG: tl.constexpr):
+    """Means over groups of channels of reference times sample, (sites, groups)."""
+    column, size = tl.arange(0, CONFIG.columns)[None, :], tl.maximum(n.channels // n.features, 1)
+    values = tl.zeros([CONFIG.sites, CONFIG.columns], tl.float32)
+    for number in range(n.chunks):
+        channel, exists = _chunk(number, n, CONFIG)
+        product = _sampled(source, view, projection, channel, exists, n, CONFIG)
+        product = _clamp(product * _reference(lattice, view, projection, site, channel, exists, n), LARGEST) / size
+        for group in range(n.features):
+            share = tl.sum(tl.where((channel // size == group)[None, :], product, 0.0), 1)
+            values += tl.where(column == group, share[:, None], 0.0)
+    return _clamp(values, LARGEST)
+
+
+@triton.jit
 def _values(PART: tl.constexpr, source, lattice, points, view, projection, site, n, CONFIG: tl.constexpr):
-    """A view's channels, (sites, channels): sampled, or geometric."""
+    """A view's channels, (sites, channels): sampled or correlated, or geometric."""
     channel, exists, _ = _channels(PART, site, n, CONFIG)
-    if PART == FEATURES:
-        cell = _cell(projection, n, CONFIG)
-        start = _view_start(source, view, n)
-        values = tl.zeros([CONFIG.sites, CONFIG.channels], tl.float32)
-        for corner in tl.static_range(CONFIG.corners):
-            x, y, z, weight_x, weight_y, weight_z, inside = _tap(cell, n, corner, CONFIG)
-            # Sites not in front read nothing, so that a NaN in the features does no harm.
-            mask = (projection.front & inside)[:, None] & exists[None, :]
-            value = tl.load(_addresses(source, start, z, y, x, channel), mask=mask, other=0.0).to(tl.float32)
-            values += value * (weight_x * weight_y * weight_z)[:, None]
-        return values
+    if PART == FEATURES and CONFIG.correlates:
+        return _correlations(source, lattice, view, projection, site, n, CONFIG)
+    elif PART == FEATURES:
+        return _sampled(source, view, projection, channel, exists, n, CONFIG)
     elif CONFIG.kind == PIXELS:
         mask = site.keep[:, None] & exists[None, :]
         return _clamp(
@@ -288,7 +354,7 @@ def _store_visible(visible, seen, view, site, n):
 @triton.jit
 def _moments(PART: tl.constexpr, share, source, lattice, points, site, n, near, CONFIG: tl.constexpr):
     """Mean and maximum (sites, channels), the first view that attains it, and the largest magnitude of the tile."""
-    WIDTH: tl.constexpr = CONFIG.channels if PART == FEATURES else CONFIG.width
+    WIDTH: tl.constexpr = CONFIG.columns if PART == FEATURES else CONFIG.width
     mean = tl.zeros([CONFIG.sites, WIDTH], tl.float32)
     best = tl.full([CONFIG.sites, WIDTH], float("-inf"), tl.float32)
     first = tl.full([CONFIG.sites, WIDTH], -1, tl.int32)
@@ -330,7 +396,7 @@ def _variance(PART: tl.constexpr, mean, share, source, lattice, points, site, n,
 def _store(out, values, start, BLOCK: tl.constexpr, PART: tl.constexpr, site, n, CONFIG: tl.constexpr):
     """Write a tile to block `BLOCK` of the output's channels."""
     _, exists, channel = _channels(PART, site, n, CONFIG)
-    channel += BLOCK * (n.channels + CONFIG.extras)
+    channel += BLOCK * (n.features + CONFIG.extras)
     mask = site.keep[:, None] & exists[None, :]
     values = _clamp(values, CONFIG.largest) if CONFIG.largest < LARGEST else values
     addresses = _addresses(out, start, site.k, site.j, site.i, channel)

@@ -28,12 +28,22 @@ class Tables(NamedTuple):
     direction: Tensor | None
     direction_scale: Tensor | None  # (B, V), of the direction's matrix
     exact: Tensor  # z, or the depth of volumes, float64
+    depths: Tensor | None  # (B, V, 1, D, H, W) float32, where each site has its own; z and depth are then not used
 
 
 def tables(sites: Sites, options: Options, volume: bool) -> Tables:
     """The tables of a call. Masked views have matrices of zeros, so that theirs are not read."""
     mask = sites.view_mask
-    z = per_view(sites.z, sites.matrix)
+    B, V = sites.matrix.shape[:2]
+    depths = None
+    if not sites.per_site:
+        z = per_view(sites.z, sites.matrix)
+    else:
+        z, depths = sites.matrix.new_ones(B, V, 1), sites.z
+        if depths.dtype == torch.float64:  # what is positive and finite stays so
+            limits = torch.finfo(torch.float32)
+            depths = depths.clamp(limits.smallest_normal, limits.max).float()
+        depths = depths.expand(B, V, *depths.shape[2:])[:, :, None]
     matrix, direction = sites.matrix, sites.direction if options.direction else None
     if mask is not None:
         z = torch.where(mask[..., None], z, 1.0)
@@ -43,7 +53,8 @@ def tables(sites: Sites, options: Options, volume: bool) -> Tables:
     kept = one if mask is None else mask.to(one.dtype)
     scale, direction_scale = one, None
     if not volume:  # homogeneous: a factor moves no pixel
-        scale = scale_below_overflow(lattice_extent(matrix, sites._replace(z=z)))
+        extent = lattice_extent(matrix, sites if sites.per_site else sites._replace(z=z))
+        scale = scale_below_overflow(extent)
         matrix = matrix * scale[..., None, None]
     fields = [matrix.flatten(2), scale[..., None], kept[..., None]]
     if direction is None:
@@ -67,7 +78,33 @@ def tables(sites: Sites, options: Options, volume: bool) -> Tables:
         direction,
         direction_scale,
         z if depth is None else depth,
+        depths,
     )
+
+
+def site_gradients(
+    tables: Tables, options: Options, index: Tensor | None, extra: Tensor | None, depths: Tensor | None
+) -> tuple[Tensor, Tensor | None, Tensor]:
+    """As `lattice_gradients`, where each site has its own depth: (B, V, 3, 4) twice and (B, V, D, H, W).
+
+    Args:
+        tables: of the call.
+        options: of the call.
+        index: (B V, D, blocks, tiles, 12), of the rows of M: of each g w x, g w y, g w and g z.
+        extra: (B V, D, blocks, 16): of the depth's row, and of the rows of G.
+        depths: (B V, parts, D, H, W).
+    """
+    columns = [0, 1, 3, 2]  # of x, y, z and 1
+    matrix, direction = torch.zeros_like(tables.matrix), None
+    if index is not None:
+        matrix += index.sum((1, 2, 3), dtype=torch.float64).view_as(matrix)[..., columns]
+    total = None if extra is None else extra.sum((1, 2), dtype=torch.float64)
+    if options.depth and total is not None and tables.depth is None:
+        matrix[..., 2, :] += total[:, :4].view(*matrix.shape[:2], 4)[..., columns]
+    if tables.direction is not None and tables.direction_scale is not None and total is not None:
+        direction = total[:, 4:].view_as(matrix)[..., columns] * tables.direction_scale[..., None, None]
+    assert depths is not None
+    return matrix * tables.scale[..., None, None], direction, depths.sum(1).unflatten(0, tuple(matrix.shape[:2]))
 
 
 def lattice_gradients(

@@ -54,6 +54,8 @@ def plan(
     points: Sequence[Tensor | None] = (None, None, None),
     volume: bool = False,
     needs: tuple[bool, bool] = (False, False),
+    reference: Tensor | None = None,
+    needs_reference: bool = False,
 ) -> Call:
     """Choose the tiles of a launch.
 
@@ -66,19 +68,24 @@ def plan(
         points: pixels, front and geometric channels of given pixels.
         volume: whether the source is a volume.
         needs: whether the gradients to the source and to the geometry are needed.
+        reference: (B, C, D or 1, H, W), to correlate the samples with.
+        needs_reference: whether the gradient to it is needed.
     """
     types = _types()
     views, channels = source.shape[1:3]
     planes, height, width = target.shape[3:]
-    columns = _clamped(_power_of_two(channels), CHANNELS)
-    block = _clamped(TILE // columns, SITES)
+    chunk = _clamped(_power_of_two(channels), CHANNELS)
+    features = channels if reference is None else options.groups
+    columns = chunk if reference is None else _power_of_two(features)
+    block = _clamped(TILE // max(chunk, columns), SITES)
     # Small planes share a program. Where the third axis is the fastest in memory, a store along it is one transaction.
     run = max(1, block // _power_of_two(height * width))
     if 0 < target.stride(3) < max(target.stride(4), target.stride(5)):
         run = max(run, PLANES)
     run = min(run, _power_of_two(planes))
     block = max(run, block)
-    tiles, slabs = max(1, -(-channels // columns)), -(-planes // run)
+    chunks, slabs = max(1, -(-channels // chunk)), -(-planes // run)
+    tiles = chunks if reference is None else 1
     blocks = -(-height * width // (block // run))
     order = {name: place for place, name in enumerate(options.reduce)}
     kind = types.PIXELS if lattice is None else types.VOLUME if volume else types.IMAGES
@@ -97,17 +104,23 @@ def plan(
         largest=min(saturation_limit(target.dtype), torch.finfo(torch.float32).max),
         sites=block,
         planes=run,
-        channels=columns,
+        channels=chunk,
+        columns=columns,
         width=_power_of_two(extras),
         corners=1 if options.mode == "nearest" else 8 if volume else 4,
         needs_source=needs[0],
         needs_geometry=needs[1],
+        needs_reference=needs_reference,
+        per_site=lattice is not None and lattice.depths is not None,
+        correlates=reference is not None,
     )
     cells = source.shape[3:]
+    depths = None if lattice is None or lattice.depths is None else strided(lattice.depths)
+    other = None if reference is None else strided_reference(reference)
     return Call(
-        types.Lattice(*(None,) * 5) if lattice is None else types.Lattice(*lattice[:5]),
+        types.Lattice(*(None,) * 7) if lattice is None else types.Lattice(*lattice[:5], depths, other),
         types.Points(*points),
-        types.Sizes(views, channels, planes, height, width, *cells, tiles, blocks, slabs),
+        types.Sizes(views, channels, features, planes, height, width, *cells, tiles, chunks, blocks, slabs),
         config,
         min(float(options.near), torch.finfo(torch.float32).max),
         tiles * blocks * slabs * source.shape[0] * (1 if options.reduce else views),
@@ -136,6 +149,23 @@ def launch(name: str, call: Call, *arrays: Any) -> None:
 def strided(array: Tensor) -> Any:
     """A (B, V, C, z, y, x) array for a kernel."""
     return _types().Strided(array, *array.stride())
+
+
+def strided_reference(reference: Tensor) -> Any:
+    """A (B, C, D or 1, H, W) array for a kernel, the same for all planes where it has one."""
+    b, c, z, y, x = reference.stride()
+    return _types().Strided(reference, b, 0, c, z if reference.shape[2] > 1 else 0, y, x)
+
+
+def into_of(source: Tensor, scale: Tensor | None, reference: Accumulator | None) -> Any:
+    """The `types.Into` of a backward."""
+    other = (None, None) if reference is None else (strided_reference(reference.array[:, 0]), reference.scale)
+    return _types().Into(strided(source), scale, *other)
+
+
+def sums_of(*sums: Tensor | None) -> Any:
+    """The `types.Sums` of a backward."""
+    return _types().Sums(*sums)
 
 
 def _power_of_two(count: int) -> int:
@@ -179,7 +209,13 @@ class Accumulator(NamedTuple):
 
 
 def accumulator(
-    gradient: Tensor, source: Tensor, options: Options, sites: int, shared: bool, given: Tensor | None = None
+    gradient: Tensor,
+    source: Tensor,
+    options: Options,
+    sites: int,
+    shared: bool,
+    given: Tensor | None = None,
+    factor: Tensor | None = None,
 ) -> Accumulator:
     """Memory to add to: float32, or fixed-point numbers where results must not depend on the order of the sums.
 
@@ -190,6 +226,7 @@ def accumulator(
         sites: how many sites may add to one cell.
         shared: whether the views add to the same cells.
         given: float32 memory to add to, (B, 1, C, d, h, w); zeros if None.
+        factor: what the source is correlated with.
     """
     fixed = torch.are_deterministic_algorithms_enabled() and gradient.numel() > 0
     if given is not None and not fixed:
@@ -201,19 +238,35 @@ def accumulator(
         return Accumulator(array)
     bound = torch.linalg.vector_norm(gradient, math.inf, dtype=torch.float32).double() * max(1, len(options.reduce))
     if "variance" in options.reduce and source.numel():
-        largest = source.float().nan_to_num(0.0, 0.0, 0.0).abs().amax().double()
+        largest = _largest(source) * (1.0 if factor is None else _largest(factor))
         bound = bound * (1.0 + 8.0 * largest)
+    if factor is not None:
+        bound = bound * _largest(factor)
     exponent = 62.0 - math.ceil(math.log2(max(1, sites))) - torch.log2(bound).ceil()
     scale = torch.where(bound.isfinite(), torch.exp2(exponent.clamp(-126.0, 126.0)), torch.nan)
     return Accumulator(array, scale.float().reshape(1))  # NaN if the gradient is not finite
 
 
-def allocate_sums(call: Call, options: Options, needed: bool, like: Tensor) -> tuple[Tensor | None, Tensor | None]:
-    """Memory for the sums of `lattice_gradients` that the kernel writes."""
+def _largest(tensor: Tensor) -> Tensor:
+    """The largest finite magnitude, float64."""
+    if not tensor.numel():
+        return tensor.new_zeros((), dtype=torch.float64)
+    return tensor.float().nan_to_num(0.0, 0.0, 0.0).abs().amax().double()
+
+
+def allocate_sums(
+    call: Call, options: Options, needed: bool, like: Tensor
+) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    """Memory for what the kernel writes for the gradients to the geometry, see `types.Sums`."""
     types = _types()
-    n, index, extra = call.sizes, None, None
+    n, index, extra, depths = call.sizes, None, None, None
+    rows = 3 * (types.ROW_PER_SITE if call.config.per_site else types.ROW).value
     if needed and options.mode != "nearest":
-        index = like.new_empty((call.views, n.planes, n.blocks, n.tiles, types.INDEX_SUMS.value), dtype=torch.float32)
+        index = like.new_empty((call.views, n.planes, n.blocks, n.tiles, rows), dtype=torch.float32)
     if needed and call.config.extras:
-        extra = like.new_empty((call.views, n.planes, n.blocks, types.EXTRA_SUMS.value), dtype=torch.float32)
-    return index, extra
+        sums = types.DEPTH_SUMS.value + rows
+        extra = like.new_zeros((call.views, n.planes, n.blocks, sums), dtype=torch.float32)
+    if needed and call.config.per_site:
+        parts = n.tiles + (call.config.extras > 0)
+        depths = like.new_zeros((call.views, parts, n.planes, n.height, n.width), dtype=torch.float32)
+    return index, extra, depths

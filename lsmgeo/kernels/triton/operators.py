@@ -16,7 +16,7 @@ from torch import Tensor
 from lsmgeo._dtypes import saturating_cast
 from lsmgeo._torch_compat import as_constant
 from lsmgeo.kernels.request import Options, Sites
-from lsmgeo.kernels.triton.launch_tables import lattice_gradients, tables
+from lsmgeo.kernels.triton.launch_tables import lattice_gradients, site_gradients, tables
 from lsmgeo.kernels.triton.launcher import (
     Accumulator,
     Call,
@@ -24,9 +24,11 @@ from lsmgeo.kernels.triton.launcher import (
     allocate_sums,
     channels_last,
     empty_channels_last,
+    into_of,
     launch,
     plan,
     strided,
+    sums_of,
 )
 
 
@@ -74,26 +76,36 @@ def _forward(
 
 
 @torch.no_grad()
-def unproject(source: Tensor, sites: Sites, options: Options) -> tuple[Tensor, Tensor]:
+def unproject(source: Tensor, sites: Sites, reference: Tensor | None, options: Options) -> tuple[Tensor, Tensor]:
     """As `reference.unproject`; values are channels last in memory."""
     B, V, C = source.shape[:3]
-    channels = (C + options.appended()) * max(1, len(options.reduce))
-    out = empty_channels_last(B, 1 if options.reduce else V, channels, *sites.counts(), like=source)
-    visible = _forward(source.unsqueeze(3), out, options, options.appended(), sites)
+    channels = ((C if reference is None else options.groups) + options.appended()) * max(1, len(options.reduce))
+    shape = B, 1 if options.reduce else V, channels, *sites.counts()
+    out = source.new_empty(shape) if options.contiguous else empty_channels_last(*shape, like=source)
+    visible = _forward(source.unsqueeze(3), out, options, options.appended(), sites, reference=reference)
     return _without_views(out, options), visible
 
 
 @torch.no_grad()
 def unproject_backward(
-    gradient: Tensor, source: Tensor, sites: Sites, options: Options, needs: tuple[bool, bool, bool, bool]
-) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """Vector-Jacobian product of `unproject` to source, matrix, direction and z, None where not in `needs`.
+    gradient: Tensor,
+    source: Tensor,
+    sites: Sites,
+    reference: Tensor | None,
+    options: Options,
+    needs: tuple[bool, bool, bool, bool, bool],
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+    """Vector-Jacobian product of `unproject` to source, matrix, direction, z and reference, None where not in `needs`.
 
-    The gradient may have any strides. That to the source has its dtype; those to matrices (B, V, 3, 4) and z (B, V, D)
-    are float64.
+    The gradient may have any strides. Those to source and reference have their dtype; those to matrices (B, V, 3, 4)
+    and z (B, V, D) are float64; that to the depths of each site is float32, of their shape.
     """
-    found = _lattice_backward(_with_views(gradient, options), source.unsqueeze(3), sites, options, needs, False)
-    return None if found[0] is None else saturating_cast(found[0].squeeze(3), source.dtype), *found[1:]
+    found = _lattice_backward(
+        _with_views(gradient, options), source.unsqueeze(3), sites, options, needs, False, reference=reference
+    )
+    to_source = None if found[0] is None else saturating_cast(found[0].squeeze(3), source.dtype)
+    to_reference = None if found[4] is None else saturating_cast(found[4], source.dtype)
+    return to_source, *found[1:4], to_reference
 
 
 def _lattice_backward(
@@ -101,24 +113,46 @@ def _lattice_backward(
     source: Tensor,
     sites: Sites,
     options: Options,
-    needs: tuple[bool, bool, bool, bool],
+    needs: tuple[bool, bool, bool, bool, bool],
     volume: bool,
     given: Tensor | None = None,
-) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """Gradients to a (B, V or 1, C, d, h, w) source, in float32, and to the geometry."""
-    wanted = needs[0], any(needs[1:])
-    count = math.prod(gradient.shape[3:]) * (source.shape[1] if volume else 1)
-    into = accumulator(gradient, source, options, count, volume, given) if needs[0] else None
+    reference: Tensor | None = None,
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+    """Gradients to a (B, V or 1, C, d, h, w) source, in float32, to the geometry, and to the reference, in float32."""
+    wanted, of_reference = (needs[0], any(needs[1:4])), needs[4]
+    planes, *pixels = gradient.shape[3:]
+    count = planes * math.prod(pixels) * (source.shape[1] if volume else 1)
+    into = accumulator(gradient, source, options, count, volume, given, reference) if needs[0] else None
+    other = None
+    if reference is not None and of_reference:
+        adds = source.shape[1] * (planes if reference.shape[2] == 1 else 1)
+        other = accumulator(gradient, reference[:, None], options, adds, False, factor=source)
     if count:
         known = tables(sites, options, volume)
-        call = plan(source, gradient, options, options.appended(), known, volume=volume, needs=wanted)
-        index_sums, extra_sums = allocate_sums(call, options, wanted[1], source)
-        _launch_backward(call, gradient, source, into, index_sums, extra_sums)
-        found = lattice_gradients(known, options, index_sums, extra_sums) if wanted[1] else (None,) * 3
+        call = plan(
+            source,
+            gradient,
+            options,
+            options.appended(),
+            known,
+            volume=volume,
+            needs=wanted,
+            reference=reference,
+            needs_reference=of_reference,
+        )
+        sums = allocate_sums(call, options, wanted[1], source)
+        _launch_backward(call, gradient, source, into, sums, other)
+        found: tuple[Tensor | None, ...] = (None,) * 3
+        if wanted[1] and sites.per_site:
+            found = site_gradients(known, options, *sums)
+        elif wanted[1]:
+            found = lattice_gradients(known, options, *sums[:2])
     else:
-        shape = sites.matrix.shape
-        found = torch.zeros_like(sites.matrix), None, sites.matrix.new_zeros((*shape[:2], sites.z.shape[-1]))
+        shape = sites.z.shape if sites.per_site else (*sites.matrix.shape[:2], sites.z.shape[-1])
+        found = torch.zeros_like(sites.matrix), None, sites.matrix.new_zeros(shape)
     matrix, direction, z = found
+    if z is not None and sites.per_site:
+        z = (z.sum(1, keepdim=True) if sites.z.shape[1] < z.shape[1] else z).float()
     if direction is None and sites.direction is not None:
         direction = torch.zeros_like(sites.direction)
     return (
@@ -126,6 +160,7 @@ def _lattice_backward(
         matrix if needs[1] else None,
         direction if needs[2] else None,
         z if needs[3] else None,
+        None if other is None else other.total()[:, 0],
     )
 
 
@@ -134,16 +169,15 @@ def _launch_backward(
     gradient: Tensor,
     source: Tensor,
     into: Accumulator | None,
-    index_sums: Tensor | None,
-    extra_sums: Tensor | None,
+    sums: tuple[Tensor | None, Tensor | None, Tensor | None],
+    other: Accumulator | None = None,
 ) -> None:
-    if into is None and index_sums is None and extra_sums is None:
+    if into is None and other is None and sums[0] is None and sums[1] is None:
         return  # the nearest cell does not depend on the geometry
-    if index_sums is not None or call.config.reduce:
+    if sums[0] is not None or call.config.reduce or call.config.correlates:
         source = channels_last(source, math.prod(gradient.shape[3:]) * call.config.corners)
     array, scale = (source, None) if into is None else (into.array.expand(source.shape), into.scale)
-    arrays = strided(gradient), strided(source), strided(array), scale, index_sums, extra_sums
-    launch("resample_backward", call, *arrays)
+    launch("resample_backward", call, strided(gradient), strided(source), into_of(array, scale, other), sums_of(*sums))
 
 
 @torch.no_grad()
@@ -189,7 +223,7 @@ def sample_views_backward(
         index_sums = source.new_empty((B, V, N, call.sizes.tiles, 2), dtype=torch.float32)
     if any(needs[1:]) and extras:
         extra_sums = source.new_empty((B, V, extras, N), dtype=torch.float32)
-    _launch_backward(call, target, maps, into, index_sums, extra_sums)
+    _launch_backward(call, target, maps, into, (index_sums, extra_sums, None))
     grad_pixels = grad_extra = None
     if needs[1]:
         grad_pixels = torch.zeros_like(pixels) if index_sums is None else index_sums.sum(3).to(pixels.dtype)
@@ -208,7 +242,9 @@ def plane_sweep_project(
     """
     (B, C), V = source.shape[:2], sites.matrix.shape[1]
     channels, (P, h, w) = C + options.appended(), sites.counts()
-    if out is None and options.flatten:
+    if out is None and options.contiguous:
+        out = source.new_empty(B, V, channels, P, h, w)
+    elif out is None and options.flatten:
         out = source.new_empty((B, V, h, w, channels, P)).permute(0, 1, 4, 5, 2, 3)
     elif out is None:
         out = empty_channels_last(B, V, channels, P, h, w, like=source)
@@ -236,7 +272,7 @@ def plane_sweep_project_backward(
     """
     views = _per_view(source, sites.matrix.shape[1])
     given = None if into is None else into[:, None]
-    total, matrix, direction, z = _lattice_backward(gradient, views, sites, options, needs, True, given)
+    total, matrix, direction, z, _ = _lattice_backward(gradient, views, sites, options, (*needs, False), True, given)
     if total is None:
         found = None
     elif into is None:

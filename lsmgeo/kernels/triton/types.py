@@ -34,9 +34,11 @@ DIRECTION_FIELDS = tl.constexpr(14)
 TERMS = tl.constexpr(26)
 
 # Sums over the sites of a plane that a program writes: for each of three rows g x, g y and g, g a gradient. Those of
-# geometric channels start with the row of the depth and its gradient through s.
-INDEX_SUMS = tl.constexpr(9)
-EXTRA_SUMS = tl.constexpr(13)
+# geometric channels start with four of the depth: its row, and its gradient through s. Where each site has its own
+# depth, q is (w x, w y, z, w), and there is a sum g z more for each row.
+ROW = tl.constexpr(3)
+ROW_PER_SITE = tl.constexpr(4)
+DEPTH_SUMS = tl.constexpr(4)
 
 
 class Strided(NamedTuple):
@@ -59,6 +61,8 @@ class Lattice(NamedTuple):
     y: Any  # (H,)
     z: Any  # (B V, D)
     depth: Any  # (B V, D), of frustums in volumes
+    depths: Any  # `Strided`, where each site has its own
+    reference: Any  # `Strided`, to correlate the samples with
 
 
 class Points(NamedTuple):
@@ -69,11 +73,29 @@ class Points(NamedTuple):
     extra: Any  # (B V, E, N) float32
 
 
+class Into(NamedTuple):
+    """What gradients are added to: float32, or int64 in units of 1 / scale, a scale (1,) float32 then, else None."""
+
+    source: Any  # `Strided`
+    source_scale: Any
+    reference: Any  # `Strided`, or None
+    reference_scale: Any
+
+
+class Sums(NamedTuple):
+    """What a backward writes, float32, or None."""
+
+    index: Any  # (B V, D, blocks, tiles, 9 or 12), or the pixels' gradients (B V, N, tiles, 2)
+    extra: Any  # (B V, D, blocks, 13 or 16), or the given channels' gradients (B V, E, N)
+    depths: Any  # (B V, tiles and 1 with geometric channels, D, H, W)
+
+
 class Sizes(NamedTuple):
     """Counts of views, channels, sites and cells, and into how many programs each is divided."""
 
     views: Any
-    channels: Any
+    channels: Any  # of the source
+    features: Any  # of the values, before the geometric ones: as many, or groups
     planes: Any  # D or P
     height: Any
     width: Any  # of the lattice; the number of pixels
@@ -81,6 +103,7 @@ class Sizes(NamedTuple):
     cells_y: Any
     cells_x: Any
     tiles: Any  # of channels
+    chunks: Any  # of channels that one program correlates after another
     blocks: Any  # of sites in a plane
     slabs: Any  # of planes
 
@@ -102,11 +125,15 @@ class Config(NamedTuple):
     largest: float  # above it the output saturates, see `lsmgeo._dtypes.saturation_limit`
     sites: int  # of a tile
     planes: int  # of them along the third axis: 1 unless that is the fastest in the output
-    channels: int  # of the features' tile
+    channels: int  # of a tile of the source
+    columns: int  # of the tile of the values' features
     width: int  # of the tile of geometric channels
     corners: int  # cells that a sample reads
     needs_source: bool = False
     needs_geometry: bool = False
+    needs_reference: bool = False
+    per_site: bool = False  # whether each site has its own depth
+    correlates: bool = False
 
 
 class Site(NamedTuple):

@@ -87,8 +87,9 @@ class Options(NamedTuple):
         return int(self.depth) + 3 * bool(self.direction)
 
     def on(self, backend: str) -> Options:
-        """The options with this backend. PyTorch 2.7 does not compile `_replace`."""
-        return Options(*self[:-1], backend)
+        """The options with this backend. PyTorch 2.7 compiles neither `_replace` nor a slice."""
+        how = self.mode, self.padding_mode, self.depth, self.direction, self.reduce, self.near
+        return Options(*how, self.flatten, self.groups, self.contiguous, backend)
 
     @classmethod
     def checked(

@@ -26,7 +26,7 @@ def site_coordinates(sites: Sites, matrix: Tensor, dtype: torch.dtype) -> tuple[
     Homogeneous: with the depth d of a site, ``q = (w x, w y, z, w)``, ``w = min(d, 1)`` and ``z = w / d``, so that
     nothing overflows, whatever the depth is. Otherwise w is None, for 1, and z is (B, V, D).
     """
-    if not sites.per_site:
+    if not sites.per_site():
         return None, per_view(sites.z, matrix).to(dtype)
     depth = site_depths(sites, dtype)
     is_close = depth < 1.0
@@ -83,7 +83,7 @@ def _extent(matrix: Tensor, reach: Sequence[Tensor]) -> Tensor:
 
 def lattice_extent(matrix: Tensor, sites: Sites) -> Tensor:
     """A bound on the terms of ``M q`` over a lattice, (B, V)."""
-    if sites.per_site:  # homogeneous: |z| <= 1, see `site_coordinates`
+    if sites.per_site():  # homogeneous: |z| <= 1, see `site_coordinates`
         z = torch.ones(matrix.shape[:2], dtype=torch.float64, device=matrix.device)
     else:
         z = per_view(sites.z.detach(), matrix).abs().amax(-1)
@@ -125,7 +125,7 @@ def lattice_directions(sites: Sites, dtype: torch.dtype) -> Tensor:
     z = z.detach().abs()
     terms = flat + a[..., 2] * z[..., None, None] if w is None else flat * w.detach() + a[..., 2] * z
     rows = lattice_rows(matrix, sites, dtype)
-    if sites.per_site:  # vectors may be as short as w, whose square underflows
+    if sites.per_site():  # vectors may be as short as w, whose square underflows
         factor = 1.0 / power_of_two_above(torch.stack(rows).detach().abs().amax(0))
         rows, terms = [row * factor for row in rows], terms * factor
     return unit_vectors(rows, terms, sites.view_mask)

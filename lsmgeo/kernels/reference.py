@@ -210,7 +210,7 @@ def unproject(source: Tensor, sites: Sites, reference: Tensor | None, options: O
         values, visible, depth, front = _sample_through_cameras(
             source, rows, _unit(part, scale, dtype), part.view_mask, options
         )
-        if depth is not None and part.per_site:  # again, without division by a number next to 0
+        if depth is not None and part.per_site():  # again, without division by a number next to 0
             m = part.matrix[..., 2:, :] / scale[..., None]
             depth = plane_rows(m.to(dtype), part)[:, :, :, None] * site_depths(part, dtype)[:, :, None]
             depth = mask_views(depth[:, :, 0] + m[..., 2, None, None].to(dtype), part.view_mask)
@@ -226,7 +226,7 @@ def unproject(source: Tensor, sites: Sites, reference: Tensor | None, options: O
 
 def _unit(sites: Sites, scale: Tensor, dtype: torch.dtype) -> Tensor:
     """The third coordinate of ``M q`` at depth 1, M times `scale` (B, V, 1): broadcasts to (B, V, D, H, W)."""
-    if sites.per_site:
+    if sites.per_site():
         return site_coordinates(sites, sites.matrix, dtype)[1] * scale.to(dtype)[..., None, None]
     return (per_view(sites.z, sites.matrix) * scale if sites.projective else scale).to(dtype)[..., None, None]
 
@@ -310,7 +310,7 @@ def sample_pixels(
 def _sweep(source: Tensor, sites: Sites, options: Options, output: torch.dtype) -> tuple[Tensor, Tensor]:
     dtype = source.dtype
     m = sites.matrix.to(dtype)
-    if sites.per_site:
+    if sites.per_site():
         depth = site_depths(sites, dtype)
     else:
         depth = (1.0 / per_view(sites.z, sites.matrix)).to(dtype)[..., None, None]  # (B, V, P, 1, 1)

@@ -47,14 +47,13 @@ class Sites(NamedTuple):
         """The sites of planes start to stop."""
         return self.with_geometry(self.matrix, self.direction, self.planes(self.z, start, stop))
 
-    @property
     def per_site(self) -> bool:
-        """Whether `z` holds the depth of each site."""
+        """Whether `z` holds the depth of each site. PyTorch 2.6 compiles no property of a named tuple."""
         return self.z.dim() == 5
 
     def planes(self, z: Tensor, start: int, stop: int) -> Tensor:
         """Planes start to stop of a `z` of this form."""
-        return z[:, :, start:stop] if self.per_site else z[..., start:stop]
+        return z[:, :, start:stop] if self.per_site() else z[..., start:stop]
 
     def with_geometry(self, matrix: Tensor, direction: Tensor | None, z: Tensor) -> Sites:
         """The sites with other matrices and planes. PyTorch 2.7 does not compile `_replace`."""
@@ -62,7 +61,7 @@ class Sites(NamedTuple):
 
     def counts(self) -> tuple[int, int, int]:
         """(D, H, W)."""
-        return self.z.shape[2 if self.per_site else -1], self.y.shape[0], self.x.shape[0]
+        return self.z.shape[2 if self.per_site() else -1], self.y.shape[0], self.x.shape[0]
 
 
 class Options(NamedTuple):
@@ -131,7 +130,7 @@ def invalid_depth(operator: str, value: float) -> GridError:
 
 def check_site_depths(operator: str, sites: Sites) -> None:
     """Raise `invalid_depth` for the first bad depth of a view that is not masked, where values may be read."""
-    if not sites.per_site or not can_inspect(sites.z):
+    if not sites.per_site() or not can_inspect(sites.z):
         return
     with torch.no_grad():
         good = (sites.z > 0) & sites.z.isfinite()

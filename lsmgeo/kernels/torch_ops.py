@@ -171,7 +171,7 @@ class _PlaneSweepProject:
         sites, needs = _sites(flat), flat[-1]
         matrix, direction, z = sites.matrix, sites.direction, sites.z
         to_direction = None if direction is None else direction.new_empty(direction.shape)
-        if sites.per_site:
+        if sites.per_site():
             to_z = z.new_empty(z.shape, dtype=torch.float32)
         else:
             to_z = matrix.new_empty((*matrix.shape[:2], z.shape[-1]))

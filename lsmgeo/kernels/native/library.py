@@ -194,7 +194,7 @@ def _set_sites(call: _Call, sites: Sites, options: Options) -> tuple[Tensor | No
     B, V = call.scenes, call.views = sites.matrix.shape[:2]
     matrix, x, y = sites.matrix.contiguous(), sites.x.contiguous(), sites.y.contiguous()
     direction = sites.direction.expand(B, V, 3, 4).contiguous() if options.direction else None  # type: ignore[union-attr]
-    if sites.per_site:
+    if sites.per_site():
         z = sites.z.expand(B, V, *sites.z.shape[2:])
         call.depths, call.depths_type, call.depths_stride[:] = z.data_ptr(), TYPES[z.dtype], z.stride()
     else:
@@ -246,7 +246,7 @@ def _set_geometry_gradients(call: _Call, sites: Sites, needs: Sequence[bool]) ->
         None if part is None else part.data_ptr() for part in (matrix, direction)
     )
     z = None
-    if needs[2] and sites.per_site:
+    if needs[2] and sites.per_site():
         z = torch.zeros(chunks, *sites.z.shape, dtype=torch.float32, device="cpu")
         chunk, scene, view, *_ = z.stride()
         call.depths_gradient = z.data_ptr()
@@ -300,7 +300,7 @@ def _lattice_backward(
     call, alive = _lattice_call(kind, source, sites, options)
     of_source, of_matrix, of_direction, of_z, of_reference = needs
     # One task has all views of a scene where their gradients are added to one array.
-    shares_depths = of_z and sites.per_site and sites.z.shape[1] < call.views
+    shares_depths = of_z and sites.per_site() and sites.z.shape[1] < call.views
     call.whole_scenes = kind == PLANE_SWEEP_PROJECT or of_reference or shares_depths
     to_reference = None
     if reference is not None:

@@ -36,7 +36,7 @@ def tables(sites: Sites, options: Options, volume: bool) -> Tables:
     mask = sites.view_mask
     B, V = sites.matrix.shape[:2]
     depths = None
-    if not sites.per_site:
+    if not sites.per_site():
         z = per_view(sites.z, sites.matrix)
     else:
         z, depths = sites.matrix.new_ones(B, V, 1), sites.z
@@ -53,7 +53,7 @@ def tables(sites: Sites, options: Options, volume: bool) -> Tables:
     kept = one if mask is None else mask.to(one.dtype)
     scale, direction_scale = one, None
     if not volume:  # homogeneous: a factor moves no pixel
-        extent = lattice_extent(matrix, sites if sites.per_site else sites._replace(z=z))
+        extent = lattice_extent(matrix, sites if sites.per_site() else sites._replace(z=z))
         scale = scale_below_overflow(extent)
         matrix = matrix * scale[..., None, None]
     fields = [matrix.flatten(2), scale[..., None], kept[..., None]]

@@ -143,15 +143,15 @@ def _lattice_backward(
         sums = allocate_sums(call, options, wanted[1], source)
         _launch_backward(call, gradient, source, into, sums, other)
         found: tuple[Tensor | None, ...] = (None,) * 3
-        if wanted[1] and sites.per_site:
+        if wanted[1] and sites.per_site():
             found = site_gradients(known, options, *sums)
         elif wanted[1]:
             found = lattice_gradients(known, options, *sums[:2])
     else:
-        shape = sites.z.shape if sites.per_site else (*sites.matrix.shape[:2], sites.z.shape[-1])
+        shape = sites.z.shape if sites.per_site() else (*sites.matrix.shape[:2], sites.z.shape[-1])
         found = torch.zeros_like(sites.matrix), None, sites.matrix.new_zeros(shape)
     matrix, direction, z = found
-    if z is not None and sites.per_site:
+    if z is not None and sites.per_site():
         z = (z.sum(1, keepdim=True) if sites.z.shape[1] < z.shape[1] else z).float()
     if direction is None and sites.direction is not None:
         direction = torch.zeros_like(sites.direction)

@@ -11,7 +11,7 @@ from lsmgeo.cameras import CameraTensors, centers
 
 
 def mvsnet_variance(features: Tensor, cameras: CameraTensors, depths: Tensor) -> tuple[Tensor, Tensor]:
-    """MVSNet: the variance over all views, and where it says something: at least two views see the site."""
+    """MVSNet: the variance over all views, and where it is meaningful: at least two views see the site."""
     frustum = FrustumGrid(cameras.at((slice(None), 0)), depths, size=tuple(features.shape[-2:]))
     volume, visible = Unproject(frustum, reduce="variance")(features, cameras)
     return volume, visible.sum(1) >= 2
@@ -21,7 +21,7 @@ def casmvsnet_stage(
     features: Tensor, cameras: CameraTensors, depth: Tensor, interval: float, planes: int
 ) -> tuple[Tensor, Tensor]:
     """A CasMVSNet stage: hypotheses (B, P, h, w) around a coarse depth map (B, h, w), and their variance."""
-    offsets = interval * (torch.arange(planes, dtype=depth.dtype) - planes // 2)
+    offsets = interval * (torch.arange(planes, dtype=depth.dtype, device=depth.device) - planes // 2)
     hypotheses = (depth[:, None] + offsets[:, None, None]).clamp_min(1e-3)
     volume, _ = Unproject(FrustumGrid(cameras.at((slice(None), 0)), hypotheses), reduce="variance")(features, cameras)
     return hypotheses, volume
@@ -36,9 +36,10 @@ def patchmatchnet_step(
     """
     hypotheses = torch.stack([depth.roll(shift, axis) for shift, axis in ((0, 1), (1, 1), (-1, 1), (1, 2), (-1, 2))], 1)
     frustum, sources = FrustumGrid(cameras.at((slice(None), 0)), hypotheses), cameras.at((slice(None), slice(1, None)))
-    match, _ = Unproject(frustum, groups=groups)(features[:, 1:], sources, reference=features[:, 0, :, None])
-    share = (weights / weights.sum(1, keepdim=True))[:, :, None, None]
-    return hypotheses, (match * share).sum(1)  # (B, groups, P, h, w)
+    match, visible = Unproject(frustum, groups=groups)(features[:, 1:], sources, reference=features[:, 0, :, None])
+    share = weights[:, :, None] * visible
+    share = share / share.sum(1, keepdim=True).clamp_min(1e-6)
+    return hypotheses, (match * share[:, :, None]).sum(1)  # (B, groups, P, h, w)
 
 
 def groupwise_correlation(features: Tensor, cameras: CameraTensors, depths: Tensor, groups: int) -> Tensor:

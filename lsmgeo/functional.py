@@ -93,8 +93,9 @@ def unproject(
         near: least depth of a visible site, world units.
         reference: (B, C, D or 1, H, W), of the features' dtype: answer with its correlation with the samples instead of
             these. At sites that are not in front it is not read, and the answer is 0.
-        groups: of channels, that are correlated each: of C channels the answer has this many, the means over C / groups
-            channels of reference times sample (group-wise correlation, Guo et al., 2019); 1 is the dot product over C.
+        groups: number of groups of channels. With a reference the answer has one channel for each, the mean over its
+            C / groups channels of reference times sample (group-wise correlation, Guo et al., 2019); 1 is the dot
+            product over C.
         memory_format: ``torch.contiguous_format`` for a contiguous answer; by default its strides are what is fastest.
         backend: "auto", or the name of one (see `lsmgeo.kernels.explain`).
 

@@ -106,7 +106,8 @@ def explain(operator: str, source: Tensor, **options: Any) -> str:
     Args:
         operator: "unproject", "unproject_points", "sample_views", "plane_sweep_project" or "project_reduce".
         source: the features or volume of the call.
-        **options: options of the call: mode, padding_mode, augment, direction_frame, reduce, near.
+        **options: options of the call: mode, padding_mode, augment, direction_frame, reduce, near, groups,
+            memory_format.
 
     Returns:
         A line for the call, then one for each backend.

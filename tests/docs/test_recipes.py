@@ -102,9 +102,10 @@ def test_patchmatchnet_step():
     assert hypotheses.shape == (B, 5, *SIZE)
     assert bool((hypotheses.diff(dim=1) < 0).any())  # in no order
     np.testing.assert_array_equal(hypotheses[:, 1, 1:].numpy(), depth[:, :-1].numpy())
-    values, _ = warped(hypotheses.numpy())
-    share = weights.numpy() / weights.numpy().sum(1, keepdims=True)
-    close(match, (correlation(values[:, :, :C], 3) * share[:, :, None, None]).sum(1))
+    values, visible = warped(hypotheses.numpy())
+    share = weights.numpy()[:, :, None] * visible[:, 1:]
+    share = share / np.maximum(share.sum(1, keepdims=True), 1e-6)
+    close(match, (correlation(values[:, :, :C], 3) * share[:, :, None]).sum(1))
 
 
 @pytest.mark.parametrize("groups", [1, 2, 6])

@@ -265,7 +265,7 @@ def allocate_sums(
         index = like.new_empty((call.views, n.planes, n.blocks, n.tiles, rows), dtype=torch.float32)
     if needed and call.config.extras:
         sums = types.DEPTH_SUMS.value + rows
-        extra = like.new_zeros((call.views, n.planes, n.blocks, sums), dtype=torch.float32)
+        extra = like.new_empty((call.views, n.planes, n.blocks, sums), dtype=torch.float32)
     if needed and call.config.per_site:
         parts = n.tiles + (call.config.extras > 0)
         depths = like.new_zeros((call.views, parts, n.planes, n.height, n.width), dtype=torch.float32)

@@ -7,11 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lsmgeo import functional, kernels
+from lsmgeo import kernels
 from lsmgeo._checks import check_size, describe, moved
 from lsmgeo._sites import Cameras, Grid
 from lsmgeo.errors import DTypeError, GridError
-from lsmgeo.functional import Names, Projected, Unprojected
+from lsmgeo.functional.image_sampling import Names, Unprojected, run_unproject
+from lsmgeo.functional.volume_sampling import Projected, run_plane_sweep_project
 from lsmgeo.grids import FrustumGrid, VoxelGrid, check_constant_depths
 
 __all__ = ["PlaneSweepProject", "Unproject"]
@@ -133,7 +134,7 @@ class Unproject(SamplingLayer):
         grid = self.grid if grid is None else grid
         if grid is None:
             raise GridError("Unproject: grid must be given to the layer or to the call; got None")
-        return functional.run_unproject(features, cameras, grid, view_mask, reference, self.options)
+        return run_unproject(features, cameras, grid, view_mask, reference, self.options)
 
     def extra_repr(self) -> str:
         """The arguments."""
@@ -235,7 +236,7 @@ class PlaneSweepProject(SamplingLayer):
         if depths is None:
             raise GridError("PlaneSweepProject: depths must be given to the layer or to the call; got None")
         size = self.size if size is None else size
-        return functional.run_plane_sweep_project(volume, cameras, grid, depths, size, view_mask, self.options)
+        return run_plane_sweep_project(volume, cameras, grid, depths, size, view_mask, self.options)
 
     def extra_repr(self) -> str:
         """The arguments."""

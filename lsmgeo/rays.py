@@ -27,7 +27,8 @@ from lsmgeo._dtypes import computing_dtype, saturating_cast
 from lsmgeo._sites import Cameras, sweep_sites
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
-from lsmgeo.functional import Names, Projected
+from lsmgeo.functional import Projected
+from lsmgeo.functional.image_sampling import Names
 from lsmgeo.grids import VoxelGrid, check_constant_depths
 from lsmgeo.kernels.request import Options
 from lsmgeo.kernels.view_statistics import first_maximum

@@ -1,0 +1,83 @@
+"""Bird's-eye views, volumes and features at points in a few lines each.
+
+``docs/recipes_volumes.rst`` shows them, and tests hold them to the formulas. Everywhere: features (B, V, C, h, w),
+cameras (B, V), and grids whose z axis is up.
+"""
+
+import torch
+from torch import Tensor
+
+from lsmgeo import Unproject, VoxelGrid
+from lsmgeo.cameras import CameraTensors, project, resize
+from lsmgeo.functional import sample_views, unproject_points
+
+
+def scaled(cameras: CameraTensors, x: float, y: float, size: tuple[int, int]) -> CameraTensors:
+    """Cameras of a map of `size` (h, w) whose pixel (x u, y v) is the image's (u, v), as many originals do."""
+    scale = cameras.intrinsics.new_tensor([x, y, 1.0])
+    return CameraTensors(scale[:, None] * cameras.intrinsics, cameras.cam_from_world, *size)
+
+
+def bevformer_attention(
+    features: Tensor, cameras: CameraTensors, grid: VoxelGrid, offsets: Tensor, weights: Tensor
+) -> Tensor:
+    """BEVFormer's cross-attention, one head: (B, C, H, W).
+
+    Around each of N = D H W projected points, S samples at `offsets` (B, N, S, 2), in pixels of the feature map, with
+    `weights` (B, N, S).
+    """
+    views = resize(cameras, *features.shape[-2:])
+    points = grid.centers().to(features).flatten(-4, -2).expand(len(features), -1, 3)
+    pixels, depth, visible = project(views, points)
+    pixels = pixels[..., None, :] + offsets[:, None]  # (B, V, N, S, 2)
+    depth = depth[..., None].expand(pixels.shape[:-1])
+    values, _ = sample_views(features, pixels.flatten(2, 3), depth.flatten(2), depth.flatten(2) > 0)
+    values = (values.unflatten(-1, depth.shape[2:]) * weights[:, None, None]).sum(-1)  # (B, V, C, N)
+    pillars = values.unflatten(-1, grid.shape).sum(3)  # (B, V, C, H, W)
+    hit = visible.unflatten(-1, grid.shape).any(2)[:, :, None]
+    return (pillars * hit).sum(1) / hit.sum(1).clamp_min(1)
+
+
+def simple_bev(features: Tensor, cameras: CameraTensors, grid: VoxelGrid) -> Tensor:
+    """Simple-BEV: the mean over the views that see a voxel, height in the channels: (B, C D, H, W)."""
+    return Unproject(grid, reduce="mean")(features, cameras).volume.flatten(1, 2)
+
+
+def imvoxelnet_volume(features: Tensor, cameras: CameraTensors, grid: VoxelGrid) -> tuple[Tensor, Tensor]:
+    """ImVoxelNet: the nearest feature, the mean over the views that see a voxel; and whether any does, (B, D, H, W)."""
+    volume, visible = Unproject(grid, mode="nearest", reduce="mean")(features, cameras)
+    return volume, visible.any(1)
+
+
+def atlas_update(
+    mean: Tensor, count: Tensor, features: Tensor, cameras: CameraTensors, grid: VoxelGrid
+) -> tuple[Tensor, Tensor]:
+    """Atlas: the running mean (B, C, D, H, W) and its number of views (B, 1, D, H, W), after V more views."""
+    volume, visible = Unproject(grid, mode="nearest")(features, cameras)
+    seen = visible.sum(1)[:, None]
+    total = count + seen
+    return mean + (volume.sum(1) - seen * mean) / total.clamp_min(1), total
+
+
+def neuralrecon_points(features: Tensor, cameras: CameraTensors, points: Tensor) -> tuple[Tensor, Tensor]:
+    """NeuralRecon's features (B, C + 1, N) of sparse voxels at `points` (B, N, 3), and how many views see each.
+
+    The last channel is the mean depth, standardised over the voxels that are seen.
+    """
+    volume, visible = unproject_points(features, cameras, points, augment="depth", reduce="mean")
+    count = visible.sum(1)  # (B, N)
+    depth = volume[:, -1]
+    mean = depth.sum(1, keepdim=True) / (count > 0).sum(1, keepdim=True).clamp_min(1)
+    depth = torch.where(count > 0, depth - mean, 0.0)
+    depth = depth / (depth.norm(dim=1, keepdim=True) + 1e-5)
+    return torch.cat((volume[:, :-1], depth[:, None]), 1), count
+
+
+def pixelnerf_inputs(features: Tensor, cameras: CameraTensors, points: Tensor, directions: Tensor) -> Tensor:
+    """PixelNeRF's inputs (B, V, C + 6, N) at points (B, N, 3) of rays with `directions` (B, N, 3).
+
+    Of each view: its feature, and the point and the ray's direction in the frame of its camera.
+    """
+    latent, _ = unproject_points(features, cameras, points, padding_mode="border")
+    R, t = cameras.cam_from_world[..., :3, :3], cameras.cam_from_world[..., :3, 3:]
+    return torch.cat((latent, R @ points[:, None].mT + t, R @ directions[:, None].mT), 2)

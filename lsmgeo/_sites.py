@@ -5,6 +5,7 @@ The matrices are composed in float64, only here. Nothing below this module knows
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import prod
 
 import torch
@@ -14,28 +15,31 @@ from lsmgeo._checks import check_devices, check_float, describe
 from lsmgeo._linalg import affine_inverse, multiply
 from lsmgeo.cameras.camera_checks import check_views, views_per_scene
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
-from lsmgeo.cameras.tensors import Cameras, as_tensors, leading_shape
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, leading_shape
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
 from lsmgeo.grids import DEPTHS, FrustumGrid, Lattice, VoxelGrid, check_depths, map_size
 from lsmgeo.kernels.request import Options, Sites
 
-__all__ = ["Cameras", "Grid", "check_features", "direction_matrix", "image_matrices", "image_sites", "sweep_sites"]
+__all__ = ["Cameras", "Grid", "check_features", "direction_matrix", "image_matrices", "image_sites", "splat_sites", "sweep_sites"]
 
 Grid = VoxelGrid | FrustumGrid
 
 
-def check_features(who: str, features: Tensor, count: int | None = None) -> tuple[int, int]:
-    """Require (B, V, C, h, w), with B*V = `count` if given; return (B, V)."""
-    expected = "(B, V, C, h, w)"
+def check_features(
+    who: str, features: Tensor, count: int | None = None, expected: str = "(B, V, C, h, w)"
+) -> tuple[int, int]:
+    """Require features of this shape, with B*V = `count` if given; return (B, V)."""
     check_float(who, "features", features, expected)
-    if features.dim() != 5 or (count is not None and features.shape[0] * features.shape[1] != count):
+    rank = expected.count(",") + 1
+    if features.dim() != rank or (count is not None and features.shape[0] * features.shape[1] != count):
         # Only here, for the error: under a trace, a number that is formatted becomes a constant of the graph.
         views = "" if count is None else f" with B*V = {count} cameras"
-        product = "" if features.dim() != 5 else f", that is {features.shape[0] * features.shape[1]}"
+        product = "" if features.dim() != rank else f", that is {features.shape[0] * features.shape[1]}"
         raise ShapeError(f"{who}: features must be {expected}{views}; got {tuple(features.shape)}{product}")
-    B, V, _, h, w = features.shape
-    if V < 1 or h < 1 or w < 1:
-        raise ShapeError(f"{who}: features must be {expected}, V, h and w at least 1; got {tuple(features.shape)}")
+    B, V, _, *sizes = features.shape
+    if V < 1 or any(size < 1 for size in sizes):
+        axes = ", ".join(expected.strip("()").split(", ")[3:-1])
+        raise ShapeError(f"{who}: features must be {expected}, V, {axes} and w at least 1; got {tuple(features.shape)}")
     return B, V
 
 
@@ -125,29 +129,87 @@ def sweep_sites(
 ) -> Sites:
     """The checked sites of the views' frustums in a volume; depths may be those of each pixel if `per_pixel`."""
     check_float(who, "volume", volume, "(B, C, D, H, W)", rank=5)
-    if not isinstance(grid, VoxelGrid):
-        raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
+    _check_voxel_grid(who, grid)
     if tuple(volume.shape[2:]) != grid.shape:
         raise ShapeError(
             f"{who}: volume must be (B, C, D, H, W) with the grid's (D, H, W) = {grid.shape}; got {tuple(volume.shape)}"
         )
     tensors = as_tensors(cameras, who)
     views = views_per_scene(who, tensors, volume.shape[0], "volume's")
-    lattice = _lattice(who, grid, volume)
-    tensors = check_views(who, tensors, views, view_mask, volume=volume)
-    check_depths(who, depths, (1, 2, 3, 5) if per_pixel else (1, 2, 3), view_mask)
+    axes = (1, 2, 3, 5) if per_pixel else (1, 2, 3)
+    return _frustum_sites(who, {"volume": volume}, tensors, views, grid, depths, axes, size, view_mask, options)
+
+
+def splat_sites(
+    who: str,
+    features: Tensor,
+    weights: Tensor | None,
+    cameras: Cameras,
+    grid: VoxelGrid,
+    depths: Tensor,
+    view_mask: Tensor | None,
+    options: Options,
+) -> Sites:
+    """The checked sites in a volume of features (B, V, C, h, w) with weights, or (B, V, C, P, h, w) without."""
+    tensors = as_tensors(cameras, who)
+    count = prod(leading_shape(tensors))
+    if weights is None:
+        views = check_features(who, features, count, "(B, V, C, P, h, w)")
+    else:
+        views = check_features(who, features, count)
+        check_float(who, "weights", weights, "(B, V, P, h, w)", rank=5)
+        if weights.dtype != features.dtype:
+            raise DTypeError(f"{who}: weights must be of the features' {features.dtype}; got {weights.dtype}")
+    _check_voxel_grid(who, grid)
+    height, width = features.shape[-2:]
+    given = {"features": features} if weights is None else {"features": features, "weights": weights}
+    sites = _frustum_sites(
+        who, given, tensors, views, grid, depths, (1, 2, 3, 5), (height, width), view_mask, options
+    )
+    planes = (*views, sites.counts()[0], height, width)
+    if weights is not None and tuple(weights.shape) != planes:
+        raise ShapeError(f"{who}: weights must be (B, V, P, h, w) = {planes}; got {tuple(weights.shape)}")
+    if weights is None and features.shape[3] != planes[2]:
+        raise ShapeError(
+            f"{who}: features must be (B, V, C, P, h, w) with the depths' P = {planes[2]}; got {tuple(features.shape)}"
+        )
+    return sites
+
+
+def _check_voxel_grid(who: str, grid: VoxelGrid) -> None:
+    if not isinstance(grid, VoxelGrid):
+        raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
+
+
+def _frustum_sites(
+    who: str,
+    given: dict[str, Tensor],
+    tensors: CameraTensors,
+    views: tuple[int, int],
+    grid: VoxelGrid,
+    depths: Tensor,
+    axes: Sequence[int],
+    size: tuple[int, int] | None,
+    view_mask: Tensor | None,
+    options: Options,
+) -> Sites:
+    """The sites of the views' frustums in a volume; on the device of the `given` tensors, the first (B, ...)."""
+    source = next(iter(given.values()))
+    lattice = _lattice(who, grid, source)
+    tensors = check_views(who, tensors, views, view_mask, **given)
+    check_depths(who, depths, axes, view_mask)
     if depths.dim() > 1 and tuple(depths.shape[: min(depths.dim() - 1, 2)]) != views[: depths.dim() - 1]:
         raise ShapeError(
             f"{who}: depths must be {DEPTHS[depths.dim()]} with (B, V) = {views}; got {tuple(depths.shape)}"
         )
-    check_devices(who, volume=volume, depths=depths)
+    check_devices(who, **given, depths=depths)
     size = map_size(who, tensors, depths, size)
     matrices = camera_matrices(tensors, size, view_mask)
     frustum = matrices.world_from_frustum()
     inverse = affine_inverse(lattice.world_from_lattice)[..., :3, :]
     matrix = multiply(inverse if inverse.dim() == 2 else inverse[:, None], frustum)
     direction = direction_matrix(matrices, frustum, options.direction) if options.direction else None
-    x, y = (torch.arange(n, dtype=torch.float64, device=volume.device) for n in (size[1], size[0]))
+    x, y = (torch.arange(n, dtype=torch.float64, device=source.device) for n in (size[1], size[0]))
     if view_mask is not None and depths.dim() > 2:  # those of masked views are not read
         depths = torch.where(view_mask.reshape(*views, *(1,) * (depths.dim() - 2)), depths, 1.0)
     z = depths if depths.dim() == 5 else 1.0 / depths.double()

@@ -13,13 +13,14 @@ from lsmgeo.functional.image_sampling import (
     unproject_slabs,
     view_statistics,
 )
-from lsmgeo.functional.volume_sampling import Projected, plane_sweep_project
+from lsmgeo.functional.volume_sampling import Projected, plane_sweep_project, splat
 
 __all__ = [
     "Projected",
     "Unprojected",
     "plane_sweep_project",
     "sample_views",
+    "splat",
     "unproject",
     "unproject_points",
     "unproject_slabs",

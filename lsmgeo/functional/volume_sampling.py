@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 
 from lsmgeo import kernels
-from lsmgeo._sites import Cameras, sweep_sites
+from lsmgeo._dtypes import saturating_cast
+from lsmgeo._sites import Cameras, splat_sites, sweep_sites
 from lsmgeo.functional.image_sampling import Names
 from lsmgeo.grids import VoxelGrid
 from lsmgeo.kernels.request import Options
 
-__all__ = ["Projected", "plane_sweep_project", "run_plane_sweep_project"]
+__all__ = ["Projected", "plane_sweep_project", "run_plane_sweep_project", "run_splat", "splat"]
 
 
 class Projected(NamedTuple):
@@ -105,3 +106,78 @@ def run_plane_sweep_project(
     sites = sweep_sites("PlaneSweepProject", volume, cameras, grid, depths, size, view_mask, options)
     maps, visible = kernels.run("plane_sweep_project", volume, sites, options=options)
     return Projected(maps.flatten(2, 3) if options.flatten else maps, visible)
+
+
+def splat(
+    features: Tensor,
+    cameras: Cameras,
+    grid: VoxelGrid,
+    depths: Tensor,
+    *,
+    weights: Tensor | None = None,
+    view_mask: Tensor | None = None,
+    mode: str = "trilinear",
+    padding_mode: str = "zeros",
+    near: float = 1e-6,
+    backend: str = "auto",
+) -> Tensor:
+    """Add features along the rays of cameras to a volume: the adjoint of `plane_sweep_project`.
+
+    Equation: ``<plane_sweep_project(x), y> = <x, splat(y)>`` for every volume x and features y. Each feature is added to
+    the voxels that `plane_sweep_project` would interpolate between at its pixel and depth, with the same weights. With
+    depth probabilities as `weights` it is the lift and splat of Philion and Fidler, "Lift, Splat, Shoot", 2020.
+
+    Convention:
+        Integer pixel centres; K is resized to the feature map. A sample in the outer half voxel fades; samples outside
+        the volume, on planes at or behind `near`, and of masked views add nothing.
+
+    Args:
+        features: (B, V, C, h, w) with `weights`, or (B, V, C, P, h, w) without.
+        cameras: B*V cameras, view fastest: a kornia ``PinholeCamera`` or ``PinholeCamerasList``, or `CameraTensors`.
+        grid: the `VoxelGrid` of the volume.
+        depths: (P,), (B, P) or (B, V, P) camera z in world units, positive, strictly ascending, float32 or float64; or,
+            for each pixel, (B, V, P, h, w), positive and finite, in any order.
+        weights: (B, V, P, h, w), of the features' dtype: how much of each feature is added at each depth. Their product
+            with the features is never held.
+        view_mask: (B, V) bool; views where it is False add nothing and are unread.
+        mode: "trilinear", or "nearest": all to the voxel that contains the sample.
+        padding_mode: "zeros", or "border": samples outside the volume are added to its outermost voxels.
+        near: least depth of a plane, world units.
+        backend: "auto", or the name of one.
+
+    Returns:
+        (B, C, D, H, W), of the features' dtype: the sum over views, planes and pixels, taken in float32 or float64.
+        Differentiable in features, weights, K, R, t, the depths and the grid's pose.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, CameraError, GridError, OptionError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import VoxelGrid, functional
+        >>> from lsmgeo.cameras import orbit
+        >>> camera = orbit(torch.tensor([[0.0]]), 0.0, 2.0, focal_length=8.0, height=1, width=1)
+        >>> features = torch.full((1, 1, 1, 1, 1), 8.0)
+        >>> weights = torch.tensor([0.25, 0.75]).reshape(1, 1, 2, 1, 1)
+        >>> depths = torch.tensor([1.75, 2.25])  # the camera looks along -x from x = 2
+        >>> grid = VoxelGrid((1, 1, 2))
+        >>> functional.splat(features, camera, grid, depths, weights=weights, mode="nearest").flatten()
+        tensor([6., 2.])
+    """
+    options = kernels.check_options("Splat", "trilinear", backend, mode, padding_mode, near=near)
+    return run_splat(features, cameras, grid, depths, weights, view_mask, options)
+
+
+def run_splat(
+    features: Tensor,
+    cameras: Cameras,
+    grid: VoxelGrid,
+    depths: Tensor,
+    weights: Tensor | None,
+    view_mask: Tensor | None,
+    options: Options,
+) -> Tensor:
+    """`splat` with options that are checked already."""
+    sites = splat_sites("Splat", features, weights, cameras, grid, depths, view_mask, options)
+    volume = kernels.run("splat", features, sites, weights, grid.shape, options=options)
+    return saturating_cast(volume, features.dtype)

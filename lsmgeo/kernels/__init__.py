@@ -104,7 +104,7 @@ def explain(operator: str, source: Tensor, **options: Any) -> str:
     """Print and return, for each backend, whether "auto" would take it for a call, or why not.
 
     Args:
-        operator: "unproject", "unproject_points", "sample_views", "plane_sweep_project" or "project_reduce".
+        operator: "unproject", "unproject_points", "sample_views", "plane_sweep_project", "project_reduce" or "splat".
         source: the features or volume of the call.
         **options: options of the call: mode, padding_mode, augment, direction_frame, reduce, near, groups,
             memory_format.
@@ -125,8 +125,8 @@ def explain(operator: str, source: Tensor, **options: Any) -> str:
           reference: taken
     """
     check_choice("explain", "operator", operator, OPERATORS)
-    check_float("explain", "source", source, "(B, V, C, h, w) or (B, C, D, H, W)", rank=5)
-    smooth = "trilinear" if operator in ("plane_sweep_project", "project_reduce") else "bilinear"
+    check_float("explain", "source", source, "(B, V, C, h, w) or (B, C, D, H, W)", None if operator == "splat" else 5)
+    smooth = "trilinear" if operator in ("plane_sweep_project", "project_reduce", "splat") else "bilinear"
     call = Options.checked("explain", smooth, **options)
     lines = [f"{operator} of {tuple(source.shape)} {str(source.dtype).removeprefix('torch.')} on {source.device.type}"]
     taken = False

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
+from itertools import product
+from math import prod
 from typing import Any
 
 import torch
@@ -49,8 +51,8 @@ def why_not(operator: str, source: Tensor, options: Options) -> str | None:
 # Sampling
 
 
-def _coordinate(index: Tensor, size: int, options: Options) -> Tensor:
-    """From an array index to `grid_sample`'s coordinate, ``(2 u + 1) / n - 1`` for ``align_corners=False``."""
+def _bounded(index: Tensor, size: int, options: Options) -> Tensor:
+    """An array index by mode and padding: the nearest cell's, within the border, finite."""
     if options.mode == "nearest":
         # The cell that contains the sample; grid_sample would round half to even, and floor(u + 0.5) rounds the number
         # just below 0.5 up.
@@ -58,9 +60,13 @@ def _coordinate(index: Tensor, size: int, options: Options) -> Tensor:
         index = cell + (index.detach() - cell >= 0.5)
     if options.padding_mode == "border":
         # No gradient at and beyond the outermost centres.
-        index = torch.where((index > 0) & (index < size - 1), index, index.detach().clamp(0.0, size - 1.0))
-    else:
-        index = index.clamp(OUTSIDE, size + 1.0)  # all taps are outside there too; infinity would give NaN
+        return torch.where((index > 0) & (index < size - 1), index, index.detach().clamp(0.0, size - 1.0))
+    return index.clamp(OUTSIDE, size + 1.0)  # all taps are outside there too; infinity would give NaN
+
+
+def _coordinate(index: Tensor, size: int, options: Options) -> Tensor:
+    """From an array index to `grid_sample`'s coordinate, ``(2 u + 1) / n - 1`` for ``align_corners=False``."""
+    index = _bounded(index, size, options)
     # grid_sample undoes this with rounding errors of a few ulp. An index that is an integer must not fall into the cell
     # below, which it does not read and whose derivative it does not have: a nudge lifts it over them.
     origin = torch.full((), 1.0 / size - 1.0, dtype=index.dtype, device=index.device)
@@ -307,8 +313,8 @@ def sample_pixels(
     return saturating_cast(values, source.dtype), visible
 
 
-def _sweep(source: Tensor, sites: Sites, options: Options, output: torch.dtype) -> tuple[Tensor, Tensor]:
-    dtype = source.dtype
+def _sweep_index(sites: Sites, options: Options, dtype: torch.dtype) -> tuple[list[Tensor], Tensor, Tensor]:
+    """The index x, y, z of the frustums' sites in a volume, each (B, V, P, h, w), which are in front, their depth."""
     m = sites.matrix.to(dtype)
     if sites.per_site():
         depth = site_depths(sites, dtype)
@@ -321,7 +327,12 @@ def _sweep(source: Tensor, sites: Sites, options: Options, output: torch.dtype) 
     plane = plane_rows(m, sites).clamp(-LARGEST_COORDINATE, LARGEST_COORDINATE)
     reach = torch.where(front, depth, 0.0)
     offset = torch.where(front[:, :, None], m[..., 2, None, None, None], OUTSIDE)  # (B, V, 3, P, 1, 1) or at each site
-    index = [torch.addcmul(offset[:, :, row], plane[:, :, row, None], reach) for row in range(3)]
+    return [torch.addcmul(offset[:, :, row], plane[:, :, row, None], reach) for row in range(3)], front, depth
+
+
+def _sweep(source: Tensor, sites: Sites, options: Options, output: torch.dtype) -> tuple[Tensor, Tensor]:
+    dtype = source.dtype
+    index, front, depth = _sweep_index(sites, options, dtype)
     views = source[:, None].expand(source.shape[0], sites.matrix.shape[1], *source.shape[1:])
     values, visible = _sample(views, index, front, options)
     channel = mask_views(depth, sites.view_mask).expand(visible.shape)
@@ -381,10 +392,51 @@ def project_reduce(
     return saturating_cast(maps, source.dtype), torch.cat(seen, 2)
 
 
+def splat(features: Tensor, sites: Sites, weights: Tensor | None, shape: Sequence[int], options: Options) -> Tensor:
+    """The transpose of `plane_sweep_project`: add features to the cells of a volume at the sites of views' frustums.
+
+    Args:
+        features: (B, V, C, P, h, w), or (B, V, C, h, w) with weights.
+        sites: the views' frustums.
+        weights: (B, V, P, h, w), to multiply the features with, or None.
+        shape: (D, H, W) of the volume.
+        options: of the call.
+
+    Returns:
+        (B, C, D, H, W), float64 for float64, else float32.
+    """
+    check_site_depths("splat", sites)
+    dtype = computing_dtype(features)
+    index, front, _ = _sweep_index(sites, options, dtype)
+    values = features.to(dtype)
+    if weights is not None:
+        values = values[:, :, :, None] * weights.to(dtype)[:, :, None]
+    values = torch.where(front[:, :, None], values, 0.0)
+    sizes = tuple(reversed(shape))  # x, y, z
+    index = [_bounded(axis, size, options) for axis, size in zip(index, sizes, strict=True)]
+    lower = [axis.detach().floor() for axis in index]
+    fraction = [axis - cell for axis, cell in zip(index, lower, strict=True)]
+    B, C, total = features.shape[0], features.shape[2], prod(shape)
+    scene = torch.arange(B, device=features.device)[:, None, None, None, None] * total
+    volume = values.new_zeros(B * total, C)
+    for corner in [(0, 0, 0)] if options.mode == "nearest" else product((0, 1), repeat=3):
+        weight, inside, cell = torch.ones_like(index[0]), torch.ones_like(index[0], dtype=torch.bool), scene
+        for axis, (step, size) in enumerate(zip(corner, sizes, strict=True)):
+            if options.mode != "nearest":
+                weight = weight * (fraction[axis] if step else 1.0 - fraction[axis])
+            at = lower[axis].long() + step
+            inside = inside & (at >= 0) & (at < size)
+            cell = cell + at * prod(sizes[:axis])
+        part = torch.where(inside[:, :, None], values * weight[:, :, None], 0.0).movedim(2, -1)
+        volume = volume.index_add(0, torch.where(inside, cell, 0).flatten(), part.flatten(0, 4))
+    return volume.view(B, *shape, C).movedim(-1, 1)
+
+
 OPERATORS: dict[str, Callable[..., Any]] = {
     "unproject": unproject,
     "unproject_points": unproject_points,
     "sample_views": sample_views,
     "plane_sweep_project": plane_sweep_project,
     "project_reduce": project_reduce,
+    "splat": splat,
 }

@@ -13,7 +13,7 @@ from lsmgeo.errors import GridError, OptionError
 
 __all__ = ["OPERATORS", "Options", "Sites", "check_site_depths", "invalid_depth"]
 
-OPERATORS = ("unproject", "unproject_points", "sample_views", "plane_sweep_project", "project_reduce")
+OPERATORS = ("unproject", "unproject_points", "sample_views", "plane_sweep_project", "project_reduce", "splat")
 PADDING_MODES = ("zeros", "border")
 STATISTICS = ("mean", "variance", "max")
 
@@ -124,7 +124,7 @@ class Options(NamedTuple):
 
 def invalid_depth(operator: str, value: float) -> GridError:
     """The error for a depth of a site that is not positive and finite."""
-    who = {"unproject": "Unproject", "plane_sweep_project": "PlaneSweepProject"}[operator]
+    who = {"unproject": "Unproject", "plane_sweep_project": "PlaneSweepProject", "splat": "Splat"}[operator]
     return GridError(f"{who}: depths must be positive and finite; got {value:.6g}")
 
 

@@ -113,7 +113,7 @@ def _gradients(
     inputs: Sequence[Tensor | None],
     needs: Sequence[bool],
     backward: Callable[[list[bool]], Sequence[Tensor]],
-    forward: Callable[[], tuple[Tensor, Tensor]],
+    forward: Callable[[], tuple[Tensor, ...]],
 ) -> list[Tensor | None]:
     """The gradients to `inputs`, None where not needed.
 
@@ -127,7 +127,7 @@ def _gradients(
     if gradient is None or not any(needs):
         return [None] * len(inputs)
     if torch.is_grad_enabled() and not torch.compiler.is_compiling():  # second derivatives may follow
-        values, _ = forward()
+        values = forward()[0]
         if not values.requires_grad:
             return [None] * len(inputs)
         wanted = [part for part, need in zip(inputs, needs, strict=True) if part is not None and need]
@@ -326,9 +326,53 @@ class _ProjectReduce(_PlaneSweepProject):
         return *to_tensors, to_matrix, to_direction, None, None, _shared(to_z, sites.z), None, None, *_NO_OPTIONS
 
 
-for _operator in (_Unproject(), _SampleViews(), _PlaneSweepProject(), _ProjectReduce()):
+class _Splat(_PlaneSweepProject):
+    """The transpose of a plane sweep; `weights` (B, V, P, h, w) and the volume's (D, H, W) come before the sites."""
+
+    name, derivatives, answers = "splat", 4, "Tensor"
+    schema = f"Tensor features, Tensor? weights, int[] shape, {_SITES}, {_OPTIONS}"
+
+    def forward(self, features: Tensor, weights: Tensor | None, shape: Sequence[int], *flat: Any) -> Tensor:
+        options = _options(flat)
+        return KERNELS[options.backend].splat(features, _sites(flat), weights, shape, options)
+
+    def forward_fake(self, features: Tensor, weights: Tensor | None, shape: Sequence[int], *flat: Any) -> Tensor:
+        B, _, C = features.shape[:3]
+        return _empty(features, (B, C, *shape), (0, 2, 3, 4, 1), torch.float32)
+
+    def backward(
+        self, gradient: Tensor, features: Tensor, weights: Tensor | None, shape: Sequence[int], *rest: Any
+    ) -> tuple[Tensor, ...]:
+        *flat, needs = rest
+        options = _options(flat)
+        backward = KERNELS[options.backend].splat_backward
+        return _tensors(gradient, backward(gradient, features, _sites(flat), weights, options, needs), needs)
+
+    def backward_fake(
+        self, gradient: Tensor, features: Tensor, weights: Tensor | None, shape: Sequence[int], *flat: Any
+    ) -> tuple[Tensor, ...]:
+        _, to_matrix, _, to_z = super().backward_fake(gradient, gradient, *flat[:-1], [True] * 4)
+        to_weights = None if weights is None else weights.new_empty(weights.shape)
+        return _tensors(gradient, (_channels_last(features, features.shape, 2), to_weights, to_matrix, to_z), flat[-1])
+
+    def autograd(self, ctx: Any, gradient: Tensor | None, *_: Any) -> tuple[Tensor | None, ...]:
+        features, weights, shape, *flat = arguments = _saved(ctx)
+        sites = _sites(flat)
+        of_features, of_weights, _, of_matrix, _, _, _, of_z, *_ = ctx.needs_input_grad
+        to_features, to_weights, to_matrix, to_z = _gradients(
+            gradient,
+            (features, weights, sites.matrix, sites.z),
+            (of_features, of_weights, of_matrix, of_z),
+            lambda needs: torch.ops.lsmgeo.splat_backward(gradient, *arguments, needs),
+            lambda: (reference.splat(features, sites, weights, shape, _options(flat)),),
+        )
+        to_sites = to_matrix, None, None, None, _shared(to_z, sites.z), None, None
+        return to_features, to_weights, None, *to_sites, *_NO_OPTIONS
+
+
+for _operator in (_Unproject(), _SampleViews(), _PlaneSweepProject(), _ProjectReduce(), _Splat()):
     _name, _answers = _operator.name, ", ".join(["Tensor"] * _operator.derivatives)
-    _library.define(f"{_name}({_operator.schema}) -> (Tensor, Tensor)")
+    _library.define(f"{_name}({_operator.schema}) -> {getattr(_operator, 'answers', '(Tensor, Tensor)')}")
     _needs = f"bool[{_operator.derivatives}] needs"
     _library.define(f"{_name}_backward(Tensor gradient, {_operator.schema}, {_needs}) -> ({_answers})")
     for _full_name, _run, _fake in (
@@ -362,4 +406,5 @@ def operators(backend: str) -> dict[str, Callable[..., Any]]:
         "sample_views": partial(_at_pixels, pixels_in_front, backend),
         "plane_sweep_project": partial(_at_sites, torch.ops.lsmgeo.plane_sweep_project, backend),
         "project_reduce": partial(_at_sites, torch.ops.lsmgeo.project_reduce, backend),
+        "splat": partial(_at_sites, torch.ops.lsmgeo.splat, backend),
     }

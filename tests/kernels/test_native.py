@@ -16,7 +16,7 @@ from lsmgeo import FrustumGrid, functional, rays
 from lsmgeo._sites import image_sites, sweep_sites
 from lsmgeo.errors import BackendError
 from lsmgeo.kernels import Options, explain
-from lsmgeo.kernels.native import library
+from lsmgeo.kernels.native import library, loading
 from tests.kernels import cases
 from tests.kernels.comparison import Call, compare, sweep_call, unproject_call
 from tests.property import support
@@ -30,22 +30,22 @@ pytestmark = pytest.mark.skipif(REASON is not None, reason=f"the C++ kernels: {R
 def instruction_sets() -> list[str]:
     found = []
     if REASON is None:
-        best = library.instruction_set()
+        best = loading.instruction_set()
         for name in ("baseline", "avx2", "avx512"):
             try:
-                found.append(library.instruction_set(name))
+                found.append(loading.instruction_set(name))
             except ValueError:
                 continue
-        library.instruction_set(best)
+        loading.instruction_set(best)
     return found
 
 
 @pytest.fixture(params=instruction_sets() or ["none"])
 def instruction_set(request):
-    before = library.instruction_set()
-    library.instruction_set(request.param)
+    before = loading.instruction_set()
+    loading.instruction_set(request.param)
     yield request.param
-    library.instruction_set(before)
+    loading.instruction_set(before)
 
 
 @pytest.mark.parametrize("name", {**cases.CASES, **cases.HALF})
@@ -390,7 +390,7 @@ def test_it_can_be_turned_off():
     code = (
         "import torch; from lsmgeo import kernels;"
         "kernels.explain('unproject', torch.zeros(1, 2, 3, 4, 5));"
-        "print(kernels.native.library.empty((2, 3), torch.float32).shape)"
+        "print(kernels.native.loading.empty((2, 3), torch.float32).shape)"
     )
     text = _child(code, LSMGEO_NATIVE="0")
     assert "cpu: turned off by LSMGEO_NATIVE=0" in text
@@ -401,13 +401,13 @@ def test_it_can_be_turned_off():
 def test_a_file_that_is_no_library_is_a_reason(tmp_path: Path):
     broken = tmp_path / "_native.abi3.so"
     broken.write_bytes(b"not a library")
-    reason = library.load(broken)
+    reason = loading.load(broken)
     assert isinstance(reason, str)
     assert "_native.abi3.so does not load" in reason
 
 
 def test_another_library_is_a_reason():
-    reason = library.load(Path(torch.__file__).parent / "lib" / "libtorch_global_deps.so")
+    reason = loading.load(Path(torch.__file__).parent / "lib" / "libtorch_global_deps.so")
     assert isinstance(reason, str)
 
 

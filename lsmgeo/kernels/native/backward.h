@@ -188,7 +188,7 @@ inline void correlate_backward(const Call &call, const float *gradient, const fl
     const int64_t size = call.channels / call.groups;
     for (int64_t c = 0; c < channels;) {
         const int64_t group = (channel + c) / size, end = std::min(channels, (group + 1) * size - channel);
-        const float factor = gradient[group] / float(size);
+        const float factor = gradient[group] * float(call.share);
         if (add)
             for (; c < end; c++) out[c] += factor * other[c];
         else
@@ -198,8 +198,9 @@ inline void correlate_backward(const Call &call, const float *gradient, const fl
 
 inline float *reference_gradient(const Call &call, const Tile &tile, int s, int64_t channel) {
     const int64_t *stride = call.reference_gradient_stride;
-    return call.reference_gradient + tile.scene * stride[0] + tile.k * stride[1] + tile.j * stride[2] +
-           (tile.i + s) * stride[3] + channel;
+    const int64_t k = tile.k + (tile.along_z ? s : 0), i = tile.i + (tile.along_z ? 0 : s);
+    return call.reference_gradient + tile.scene * stride[0] + tile.view * stride[1] + k * stride[2] + tile.j * stride[3] +
+           i * stride[4] + channel;
 }
 
 inline bool needs_index_gradient(const Call &call) {
@@ -227,6 +228,7 @@ void sample_backward(const Plan &plan, int64_t scene, int64_t view, int64_t chun
     if (DIMS == 2) clear_source_gradient(call, scene, view, channel, channels);
     for (int64_t number = 0; number < plan.tiles; number++) {
         start_tile(plan, tile, scene, view, number);
+        if (appended == 0 && misses_volume(call, view_of(plan, tile), tile)) continue;
         locate<DIMS>(call, view_of(plan, tile), tile);
         Block block, reference = {};
         if (call.groups) {
@@ -238,7 +240,7 @@ void sample_backward(const Plan &plan, int64_t scene, int64_t view, int64_t chun
         for (int s = 0; s < int(tile.count); s++) {
             const float *gradient = block.first + s * block.step;
             if (call.groups) {
-                if (!tile.front[s]) {
+                if (!tile.in_range[s]) {
                     for (int axis = 0; axis < DIMS; axis++) site_gradients.grad_index[axis][s] = 0.0f;
                     continue;
                 }
@@ -257,6 +259,12 @@ void sample_backward(const Plan &plan, int64_t scene, int64_t view, int64_t chun
                     gather<DIMS>(call, tile, s, source, axes, channels, workspace.sampled);
                     correlate_backward(call, gradient, workspace.sampled, channel, channels,
                                        reference_gradient(call, tile, s, channel), true);
+                }
+                if (call.groups == 1 && !needs_index) {
+                    if (to)
+                        scatter<DIMS>(call, tile, s, to, to_axes, channels, factor + channel,
+                                      gradient[0] * float(call.share));
+                    continue;
                 }
                 correlate_backward(call, gradient, factor + channel, channel, channels, workspace.row, false);
                 gradient = workspace.row;

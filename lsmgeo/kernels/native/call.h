@@ -27,7 +27,8 @@ struct Call {
     const void *depths;            // of each site in place of z, or null
     int64_t depths_type, depths_stride[5];  // FLOAT32 or FLOAT64; scene, view, z, y, x
     const void *reference;         // to correlate the samples with, of the source's type, or null
-    int64_t reference_stride[5], groups;    // scene, channel, z, y, x; groups of channels, 0 without a reference
+    int64_t reference_stride[6], groups;    // scene, view, channel, z, y, x; groups of channels, 0 without a reference
+    double share;                  // of a product in the value of its group: 1 for sums
     const uint8_t *view_mask;      // (B, V), or null
     const float *pixels;           // (B, V, N, 2)
     const uint8_t *front;          // (B, V, N)
@@ -48,7 +49,7 @@ struct Call {
     float *depths_gradient;        // (chunks, B, V or 1, D, H, W), or null
     int64_t depths_gradient_stride[3];      // chunk, scene, view
     float *reference_gradient;     // channels adjacent, cleared, or null
-    int64_t reference_gradient_stride[4];   // scene, z, y, x
+    int64_t reference_gradient_stride[5];   // scene, view, z, y, x
     float *pixels_gradient;        // (chunks, B, V, N, 2), or null
     float *extras_gradient;        // (B, V, N, E), or null
 

@@ -72,9 +72,9 @@ inline Block load_gradient(const Call &call, const Tile &tile, int64_t channel, 
 
 inline Block load_reference(const Call &call, const Tile &tile, int64_t channel, int64_t channels, float *buffer) {
     const int64_t *stride = call.reference_stride;
-    const int64_t base = tile.scene * stride[0] + channel * stride[1] + tile.k * stride[2] + tile.j * stride[3] +
-                         tile.i * stride[4];
-    return load_channels(call.reference, call.source_type, {base, stride[4], stride[1]}, tile.count, channels, buffer);
+    Layout at = layout(stride, tile);
+    at.base += channel * at.channel;
+    return load_channels(call.reference, call.source_type, at, tile.count, channels, buffer);
 }
 
 inline void store_visible(const Call &call, const Tile &tile) {
@@ -167,18 +167,18 @@ inline bool misses_volume(const Call &call, const View &view, const Tile &tile) 
 }
 
 // Zeros for a tile that reads nothing.
-inline void store_zeros(const Call &call, Tile &tile, const Layout &at) {
+inline void store_zeros(const Call &call, Tile &tile, const Layout &at, int64_t channels) {
     for (int64_t s = 0; s < tile.count; s++) tile.visible[s] = 0;
     store_visible(call, tile);
     float *out = static_cast<float *>(call.values) + at.base;
-    if (at.channel == 1 && at.site == call.channels) {
-        std::memset(out, 0, size_t(tile.count * call.channels) * sizeof(float));
+    if (at.channel == 1 && at.site == channels) {
+        std::memset(out, 0, size_t(tile.count * channels) * sizeof(float));
     } else if (at.site == 1) {
-        for (int64_t c = 0; c < call.channels; c++)
+        for (int64_t c = 0; c < channels; c++)
             std::memset(out + c * at.channel, 0, size_t(tile.count) * sizeof(float));
     } else {
         for (int64_t s = 0; s < tile.count; s++)
-            for (int64_t c = 0; c < call.channels; c++) out[s * at.site + c * at.channel] = 0.0f;
+            for (int64_t c = 0; c < channels; c++) out[s * at.site + c * at.channel] = 0.0f;
     }
 }
 
@@ -187,10 +187,10 @@ template <int W> INLINE Floats<W> clamped_lanes(Floats<W> values, float largest)
     return below < -largest ? Floats<W>{} - largest : below;
 }
 
-// Means over groups of channels of reference times sample, one for each group. Products saturate.
+// Means, or sums, over groups of channels of reference times sample, one for each group. Products saturate.
 inline void correlate(const Call &call, const float *sampled, const float *reference, float *out) {
     const int64_t size = call.channels / call.groups;
-    const float share = 1.0f / float(size);
+    const float share = float(call.share);
     for (int64_t group = 0; group < call.groups; group++) {
         const float *a = sampled + group * size, *b = reference + group * size;
         Floats<LANES> wide = {};
@@ -220,9 +220,9 @@ void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_
     for (int64_t number = first; number < last; number++) {
         start_tile(plan, tile, scene, view, number);
         const Layout at = layout(call.values_stride, tile);
-        const bool can_skip = channels == call.channels && call.values_type == FLOAT32;
+        const bool can_skip = channels == plan.features && call.values_type == FLOAT32;
         if (can_skip && misses_volume(call, view_of(plan, tile), tile)) {
-            store_zeros(call, tile, at);
+            store_zeros(call, tile, at, channels);
             continue;
         }
         locate<DIMS>(call, view_of(plan, tile), tile);
@@ -239,7 +239,8 @@ void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_
         for (int s = 0; s < int(tile.count); s++) {
             float *to = out + s * step;
             if (!call.groups) gather<DIMS>(call, tile, s, source, axes, call.channels, to);
-            else if (!tile.front[s]) std::memset(to, 0, size_t(plan.features) * sizeof(float));
+            else if (!(DIMS == 3 ? tile.in_range : tile.front)[s])
+                std::memset(to, 0, size_t(plan.features) * sizeof(float));
             else {
                 gather<DIMS>(call, tile, s, source, axes, call.channels, workspace.sampled);
                 correlate(call, workspace.sampled, reference.first + s * reference.step, to);

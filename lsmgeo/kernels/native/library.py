@@ -1,4 +1,4 @@
-"""The C++ kernels: loading the library, and calls on tensors without derivatives.
+"""The C++ kernels: calls on tensors without derivatives.
 
 Without a compiler the package is built without the library; `why_not` then says so. The library does not depend on
 Python or PyTorch: tensors are passed as addresses and strides, and the threads are those of PyTorch's own pool.
@@ -7,107 +7,21 @@ Python or PyTorch: tensors are passed as addresses and strides, and the threads 
 from __future__ import annotations
 
 import ctypes
-import os
-import sysconfig
 from collections.abc import Sequence
-from functools import cache
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from lsmgeo._dtypes import saturating_cast
-from lsmgeo._torch_compat import as_constant
 from lsmgeo.kernels.lattice_geometry import per_view
+from lsmgeo.kernels.native.loading import Call, empty, missing, run
 from lsmgeo.kernels.request import Options, Sites, invalid_depth
 
 UNPROJECT, SAMPLE_VIEWS, PLANE_SWEEP_PROJECT = range(3)
 TYPES = {torch.float32: 0, torch.bfloat16: 1, torch.float16: 2, torch.float64: 3}
 SOURCE_TYPES = (torch.float32, torch.bfloat16, torch.float16)
 STATISTICS = {"mean": 0, "variance": 1, "max": 2}
-HUGE = 4 << 20  # bytes from which an output is allocated in huge pages
 LEAST_CHUNK = 8  # channels of a task
-
-_INTEGER, _NUMBER, _ADDRESS = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
-
-
-class _Call(ctypes.Structure):
-    """`Call` of native/call.h, field by field."""
-
-    _fields_ = (
-        *((name, _INTEGER) for name in ("kind", "threads", "scenes", "views", "channels")),
-        ("size", 3 * _INTEGER),
-        ("sites", 3 * _INTEGER),
-        *((name, _INTEGER) for name in ("nearest", "border", "projective", "depth", "direction", "extra")),
-        ("statistics", _INTEGER),
-        ("statistic", 3 * _INTEGER),
-        ("near", _NUMBER),
-        ("source", _ADDRESS),
-        ("source_type", _INTEGER),
-        ("source_stride", 5 * _INTEGER),
-        *((name, _ADDRESS) for name in ("matrix", "direction_matrix", "x", "y", "z")),
-        ("z_stride", 3 * _INTEGER),
-        ("depths", _ADDRESS),
-        ("depths_type", _INTEGER),
-        ("depths_stride", 5 * _INTEGER),
-        ("reference", _ADDRESS),
-        ("reference_stride", 5 * _INTEGER),
-        ("groups", _INTEGER),
-        *((name, _ADDRESS) for name in ("view_mask", "pixels", "front", "extras")),
-        ("values", _ADDRESS),
-        ("values_type", _INTEGER),
-        ("values_stride", 6 * _INTEGER),
-        ("visible", _ADDRESS),
-        ("gradient", _ADDRESS),
-        ("gradient_type", _INTEGER),
-        ("gradient_stride", 6 * _INTEGER),
-        ("chunks", _INTEGER),
-        ("accumulate", _INTEGER),
-        ("whole_scenes", _INTEGER),
-        ("source_gradient", _ADDRESS),
-        ("source_gradient_stride", 5 * _INTEGER),
-        *((name, _ADDRESS) for name in ("matrix_gradient", "direction_gradient", "z_gradient")),
-        ("depths_gradient", _ADDRESS),
-        ("depths_gradient_stride", 3 * _INTEGER),
-        ("reference_gradient", _ADDRESS),
-        ("reference_gradient_stride", 4 * _INTEGER),
-        *((name, _ADDRESS) for name in ("pixels_gradient", "extras_gradient")),
-        ("has_invalid_depth", _INTEGER),
-        ("invalid_depth", _NUMBER),
-    )
-
-
-@cache
-def _library() -> ctypes.CDLL | str:
-    """The library, or why it is missing."""
-    if os.environ.get("LSMGEO_NATIVE") == "0":
-        return "turned off by LSMGEO_NATIVE=0"
-    folder = Path(__file__).parent
-    names = (f"_native{suffix}" for suffix in (".abi3.so", sysconfig.get_config_var("EXT_SUFFIX"), ".so", ".pyd"))
-    path = next((folder / name for name in names if (folder / name).is_file()), None)
-    if path is None:
-        return "not built; install from source with a C++ compiler to have it"
-    return load(path)
-
-
-def load(path: Path) -> ctypes.CDLL | str:
-    """The library in a file, ready for calls, or why it cannot be used."""
-    try:
-        library = ctypes.CDLL(str(path))
-        library.lsmgeo_size_of_call.restype = ctypes.c_int64
-    except (OSError, AttributeError) as error:
-        return f"{path.name} does not load: {error}"
-    if library.lsmgeo_size_of_call() != ctypes.sizeof(_Call):
-        return f"{path.name} was built from other sources; install again"
-    library.lsmgeo_instruction_set.restype = ctypes.c_char_p
-    library.lsmgeo_use_huge_pages.argtypes = (ctypes.c_void_p, ctypes.c_int64)
-    library.lsmgeo_use_openmp.argtypes = (ctypes.c_void_p,)
-    try:
-        parallel = ctypes.CDLL(None).GOMP_parallel  # of the OpenMP runtime that PyTorch has loaded
-        library.lsmgeo_use_openmp(ctypes.cast(parallel, ctypes.c_void_p))
-    except (AttributeError, OSError, TypeError):
-        pass  # the library starts threads of its own
-    return library
 
 
 def why_not(operator: str, source: Tensor, options: Options) -> str | None:
@@ -116,48 +30,10 @@ def why_not(operator: str, source: Tensor, options: Options) -> str | None:
         return "float64 stays on the reference path"
     if source.device.type != "cpu":
         return f"its kernels are for CPU tensors, these are on {source.device.type}"
-    return _missing()
-
-
-@as_constant
-def _missing() -> str | None:
-    """Why there is no library, or None."""
-    library = _library()
-    return library if isinstance(library, str) else None
-
-
-def instruction_set(name: str | None = None) -> str:
-    """The instruction set in use: "avx512", "avx2" or "baseline"; sets another by its name, if the machine has it."""
-    library = _library()
-    if isinstance(library, str):
-        raise RuntimeError(library)
-    found = library.lsmgeo_instruction_set(None if name is None else name.encode())
-    if found is None:
-        raise ValueError(f"this machine does not have the instruction set {name!r}")
-    return found.decode()
-
-
-def empty(shape: Sequence[int], dtype: torch.dtype, order: Sequence[int] | None = None) -> Tensor:
-    """Memory for an output of this shape; `order` names its axes from the slowest to the fastest.
-
-    Large outputs are put in huge pages: touching fresh pages of 4 KiB costs as much as the kernels do.
-    """
-    order = tuple(range(len(shape))) if order is None else order
-    tensor = torch.empty([shape[axis] for axis in order], dtype=dtype, device="cpu")
-    if tensor.nbytes >= HUGE and not isinstance(library := _library(), str):
-        library.lsmgeo_use_huge_pages(tensor.data_ptr(), tensor.nbytes)
-    return tensor.permute([order.index(axis) for axis in range(len(shape))])
+    return missing()
 
 
 # Calls: `_set_*` fill in a part of the arguments; tensors must stay alive until the kernel is done.
-
-
-def _run(call: _Call, backward: bool) -> None:
-    library = _library()
-    assert not isinstance(library, str), library
-    failed = (library.lsmgeo_backward if backward else library.lsmgeo_forward)(ctypes.byref(call))
-    if failed:
-        raise MemoryError("lsmgeo: no memory for the workspace of a kernel")
 
 
 def channels_last(source: Tensor, axis: int) -> Tensor:
@@ -167,8 +43,8 @@ def channels_last(source: Tensor, axis: int) -> Tensor:
     return source.movedim(axis, -1).contiguous().movedim(-1, axis)
 
 
-def _new_call(kind: int, source: Tensor, options: Options, sites: Sequence[int]) -> _Call:
-    call = _Call()
+def _new_call(kind: int, source: Tensor, options: Options, sites: Sequence[int]) -> Call:
+    call = Call()
     call.kind, call.threads = kind, torch.get_num_threads()
     strides = source.stride()
     if kind == PLANE_SWEEP_PROJECT:
@@ -189,7 +65,7 @@ def _new_call(kind: int, source: Tensor, options: Options, sites: Sequence[int])
     return call
 
 
-def _set_sites(call: _Call, sites: Sites, options: Options) -> tuple[Tensor | None, ...]:
+def _set_sites(call: Call, sites: Sites, options: Options) -> tuple[Tensor | None, ...]:
     """Set the geometry; the result must live as long as the call."""
     B, V = call.scenes, call.views = sites.matrix.shape[:2]
     matrix, x, y = sites.matrix.contiguous(), sites.x.contiguous(), sites.y.contiguous()
@@ -208,7 +84,7 @@ def _set_sites(call: _Call, sites: Sites, options: Options) -> tuple[Tensor | No
     return matrix, direction, x, y, z, mask
 
 
-def _set_gradient(call: _Call, gradient: Tensor, options: Options) -> None:
+def _set_gradient(call: Call, gradient: Tensor, options: Options) -> None:
     """Set the incoming gradient; split the channels where there are fewer scenes and views than threads."""
     call.gradient, call.gradient_type = gradient.data_ptr(), TYPES[gradient.dtype]
     call.gradient_stride[:] = _value_strides(gradient, options)
@@ -219,7 +95,7 @@ def _set_gradient(call: _Call, gradient: Tensor, options: Options) -> None:
     call.chunks = max(1, chunks)
 
 
-def _set_source_gradient(call: _Call, source: Tensor, axis: int, into: Tensor | None) -> Tensor:
+def _set_source_gradient(call: Call, source: Tensor, axis: int, into: Tensor | None) -> Tensor:
     """Set the memory of the source's gradient, float32: `into`, to add to, or new memory that the kernel clears."""
     if into is None:
         order = [other for other in range(source.dim()) if other != axis]
@@ -236,7 +112,7 @@ def _set_source_gradient(call: _Call, source: Tensor, axis: int, into: Tensor | 
     return gradient
 
 
-def _set_geometry_gradients(call: _Call, sites: Sites, needs: Sequence[bool]) -> list[Tensor | None]:
+def _set_geometry_gradients(call: Call, sites: Sites, needs: Sequence[bool]) -> list[Tensor | None]:
     """Set the memory of the gradients to matrix, direction and z, a part for each chunk of channels."""
     views, chunks = (call.scenes, call.views), call.chunks
     matrix, direction = (
@@ -258,24 +134,31 @@ def _set_geometry_gradients(call: _Call, sites: Sites, needs: Sequence[bool]) ->
     return [matrix, direction, z]
 
 
-def _set_reference(call: _Call, reference: Tensor, options: Options) -> None:
+def _set_reference(call: Call, reference: Tensor, groups: int, share: float | None = None) -> None:
+    """Set what samples are multiplied with: (B, C, D or 1, H, W), or (B, V, C, D or 1, H, W)."""
     # An empty tensor is at address 0, which nothing is read from, but which arithmetic must not start from.
-    call.groups, call.reference = options.groups, reference.data_ptr() or ctypes.addressof(call)
-    strides = reference.stride()
-    call.reference_stride[:] = (*strides[:2], strides[2] if reference.shape[2] > 1 else 0, *strides[3:])
+    call.groups, call.reference = groups, reference.data_ptr() or ctypes.addressof(call)
+    call.share = groups / max(1, call.channels) if share is None else share
+    call.reference_stride[:] = _reference_strides(reference)
 
 
-def _set_reference_gradient(call: _Call, reference: Tensor) -> Tensor:
+def _reference_strides(reference: Tensor) -> tuple[int, ...]:
+    """Those of scene, view, channel, z, y and x; 0 for what a reference is shared by."""
+    scene, *views, channel, z, y, x = reference.stride()
+    return scene, *(views or [0]), channel, z if reference.shape[-3] > 1 else 0, y, x
+
+
+def _set_reference_gradient(call: Call, reference: Tensor) -> Tensor:
     """Where the gradient to the reference goes, in float32."""
-    B, C, *sizes = reference.shape
-    gradient = torch.zeros((B, *sizes, C), dtype=torch.float32, device="cpu")
-    scene, z, y, x, _ = gradient.stride()
+    *views, C, D, H, W = reference.shape
+    gradient = torch.zeros((*views, D, H, W, C), dtype=torch.float32, device="cpu").movedim(-1, -4)
     call.reference_gradient = gradient.data_ptr()
-    call.reference_gradient_stride[:] = (scene, z if reference.shape[2] > 1 else 0, y, x)
-    return gradient.movedim(-1, 1)
+    scene, view, _, *sites = _reference_strides(gradient)
+    call.reference_gradient_stride[:] = (scene, view, *sites)
+    return gradient
 
 
-def _lattice_call(kind: int, source: Tensor, sites: Sites, options: Options) -> tuple[_Call, tuple[Tensor | None, ...]]:
+def _lattice_call(kind: int, source: Tensor, sites: Sites, options: Options) -> tuple[Call, tuple[Tensor | None, ...]]:
     """A call on the sites of a lattice, and what must live as long as it."""
     source = channels_last(source, _channel_axis(kind))
     call = _new_call(kind, source, options, sites.counts()[::-1])
@@ -295,6 +178,7 @@ def _lattice_backward(
     needs: Sequence[bool],
     reference: Tensor | None = None,
     into: Tensor | None = None,
+    share: float | None = None,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
     """Gradients to source, matrix, direction, z and reference."""
     call, alive = _lattice_call(kind, source, sites, options)
@@ -304,22 +188,22 @@ def _lattice_backward(
     call.whole_scenes = kind == PLANE_SWEEP_PROJECT or of_reference or shares_depths
     to_reference = None
     if reference is not None:
-        _set_reference(call, reference, options)
+        _set_reference(call, reference, options.groups, share)
         to_reference = _set_reference_gradient(call, reference) if of_reference else None
     _set_gradient(call, gradient, options)
     to_source = _set_source_gradient(call, source, _channel_axis(kind), into) if of_source else None
     parts = _set_geometry_gradients(call, sites, (of_matrix, of_direction and bool(options.direction), of_z))
-    _run(call, backward=True)
+    run(call, backward=True)
     del alive
     if to_source is not None and into is None:
         to_source = saturating_cast(to_source, source.dtype)
     if to_reference is not None:
-        to_reference = saturating_cast(to_reference, source.dtype)
+        to_reference = saturating_cast(to_reference, reference.dtype)  # type: ignore[union-attr]
     return to_source, *(None if part is None else part.sum(2) for part in parts), to_reference  # type: ignore[return-value]
 
 
 def _forward(
-    call: _Call, alive: Sequence[Tensor | None], dtype: torch.dtype, options: Options, out: Tensor | None = None
+    call: Call, alive: Sequence[Tensor | None], dtype: torch.dtype, options: Options, out: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Run a call forward; `alive` must live as long as it. `out` is memory of the values' shape to write to."""
     counts, reduced = call.sites[::-1], bool(options.reduce)
@@ -333,7 +217,7 @@ def _forward(
     visible = torch.empty((call.scenes, call.views, *counts), dtype=torch.bool, device="cpu")
     call.values, call.values_type, call.visible = out.data_ptr(), TYPES[out.dtype], visible.data_ptr()
     call.values_stride[:] = _value_strides(out, options)
-    _run(call, backward=False)
+    run(call, backward=False)
     del alive
     if call.has_invalid_depth:
         raise invalid_depth(
@@ -354,7 +238,7 @@ def unproject(
     """As `reference.unproject`; `out` is memory of the values' shape to write to."""
     call, alive = _lattice_call(UNPROJECT, source, sites, options)
     if reference is not None:
-        _set_reference(call, reference, options)
+        _set_reference(call, reference, options.groups)
     return _forward(call, (*alive, reference), source.dtype, options, out)
 
 
@@ -387,7 +271,7 @@ def sample_views(
 
 def _pixels_call(
     source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options
-) -> tuple[_Call, tuple[Tensor | None, ...]]:
+) -> tuple[Call, tuple[Tensor | None, ...]]:
     call = _new_call(SAMPLE_VIEWS, source, options, (front.shape[-1], 1, 1))
     pixels, front = pixels.float().contiguous(), front.contiguous()
     extras = None if extra is None else extra.float().movedim(2, 3).contiguous()
@@ -417,7 +301,7 @@ def sample_views_backward(
     if needs[2] and extra is not None:
         to_extra = torch.zeros((*front.shape, call.extra), dtype=torch.float32, device="cpu")
         call.extras_gradient = to_extra.data_ptr()
-    _run(call, backward=True)
+    run(call, backward=True)
     del alive
     return (
         None if to_source is None else saturating_cast(to_source, original.dtype),
@@ -446,3 +330,61 @@ def plane_sweep_project_backward(
     `into` is float32 memory of the source's shape, channels next to one another, to add its gradient to.
     """
     return _lattice_backward(PLANE_SWEEP_PROJECT, gradient, source, sites, options, (*needs, False), into=into)[:-1]
+
+
+def splat(
+    features: Tensor, sites: Sites, weights: Tensor | None, shape: Sequence[int], options: Options
+) -> Tensor:
+    """As `reference.splat`: the transpose of `plane_sweep_project`, where weights times that of a correlation."""
+    B, channel = features.shape[0], features.shape[2]
+    # In place of the volume, which is not read: any memory of its shape.
+    volume = torch.empty(channel, dtype=torch.float32).expand(B, *shape, channel).movedim(-1, 1)
+    values, factor = _factors(features, weights)
+    needs = True, False, False, False, False
+    total, *_ = _lattice_backward(PLANE_SWEEP_PROJECT, values, volume, sites, options, needs, factor, share=1.0)
+    return total  # type: ignore[return-value]
+
+
+def _factors(features: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """What is added at the sites, (B, V, C or 1, P, h, w), and (B, V, C, 1, h, w) to multiply it with."""
+    if weights is None:
+        return features, None
+    return weights[:, :, None].float(), channels_last(features, 2).float()[:, :, :, None]
+
+
+def splat_backward(
+    gradient: Tensor,
+    features: Tensor,
+    sites: Sites,
+    weights: Tensor | None,
+    options: Options,
+    needs: Sequence[bool],
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
+    """Vector-Jacobian product of `splat` to features, weights, matrix and z, None where not in `needs`.
+
+    The gradient is float32. Those to features and weights have their dtype; others as those of `unproject_backward`.
+    """
+    of_features, of_weights, of_matrix, of_z = needs
+    gradient = channels_last(gradient, 1)
+    values, factor = _factors(features, weights)
+    to_features = to_weights = None
+    if of_weights if weights is not None else of_features:
+        call, alive = _lattice_call(PLANE_SWEEP_PROJECT, gradient, sites, options)
+        if factor is not None:
+            _set_reference(call, factor, 1, share=1.0)
+        found, _ = _forward(call, (*alive, factor), features.dtype, options)
+        if weights is None:
+            to_features = found
+        else:
+            to_weights = found[:, :, 0]
+    of_factor = of_features and factor is not None
+    if of_factor or of_matrix or of_z:
+        wanted = False, of_matrix, False, of_z, of_factor
+        _, to_matrix, _, to_z, to_factor = _lattice_backward(
+            PLANE_SWEEP_PROJECT, values, gradient, sites, options, wanted, factor, share=1.0
+        )
+    else:
+        to_matrix = to_z = to_factor = None
+    if to_factor is not None:
+        to_features = saturating_cast(to_factor[:, :, :, 0], features.dtype)
+    return to_features, to_weights, to_matrix, to_z

@@ -7,7 +7,7 @@ if TYPE_CHECKING:
     from lsmgeo.cameras import CameraTensors
     from lsmgeo.debugging import debug
     from lsmgeo.grids import FrustumGrid, VoxelGrid, depth_planes
-    from lsmgeo.layers import PlaneSweepProject, Unproject
+    from lsmgeo.layers import PlaneSweepProject, Splat, Unproject
 
 __version__ = "0.1.0"
 
@@ -15,6 +15,7 @@ __all__ = [
     "CameraTensors",
     "FrustumGrid",
     "PlaneSweepProject",
+    "Splat",
     "Unproject",
     "VoxelGrid",
     "__version__",
@@ -33,6 +34,7 @@ _HOMES = {
     "CameraTensors": "cameras",
     "FrustumGrid": "grids",
     "PlaneSweepProject": "layers",
+    "Splat": "layers",
     "Unproject": "layers",
     "VoxelGrid": "grids",
     "debug": "debugging",

@@ -20,7 +20,16 @@ from lsmgeo.errors import DTypeError, OptionError, ShapeError
 from lsmgeo.grids import DEPTHS, FrustumGrid, Lattice, VoxelGrid, check_depths, map_size
 from lsmgeo.kernels.request import Options, Sites
 
-__all__ = ["Cameras", "Grid", "check_features", "direction_matrix", "image_matrices", "image_sites", "splat_sites", "sweep_sites"]
+__all__ = [
+    "Cameras",
+    "Grid",
+    "check_features",
+    "direction_matrix",
+    "image_matrices",
+    "image_sites",
+    "splat_sites",
+    "sweep_sites",
+]
 
 Grid = VoxelGrid | FrustumGrid
 
@@ -163,9 +172,7 @@ def splat_sites(
     _check_voxel_grid(who, grid)
     height, width = features.shape[-2:]
     given = {"features": features} if weights is None else {"features": features, "weights": weights}
-    sites = _frustum_sites(
-        who, given, tensors, views, grid, depths, (1, 2, 3, 5), (height, width), view_mask, options
-    )
+    sites = _frustum_sites(who, given, tensors, views, grid, depths, (1, 2, 3, 5), (height, width), view_mask, options)
     planes = (*views, sites.counts()[0], height, width)
     if weights is not None and tuple(weights.shape) != planes:
         raise ShapeError(f"{who}: weights must be (B, V, P, h, w) = {planes}; got {tuple(weights.shape)}")

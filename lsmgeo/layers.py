@@ -1,4 +1,4 @@
-"""`Unproject` and `PlaneSweepProject`: the operators as modules without state."""
+"""`Unproject`, `PlaneSweepProject` and `Splat`: the operators as modules without state."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from lsmgeo._checks import check_size, describe, moved
 from lsmgeo._sites import Cameras, Grid
 from lsmgeo.errors import DTypeError, GridError
 from lsmgeo.functional.image_sampling import Names, Unprojected, run_unproject
-from lsmgeo.functional.volume_sampling import Projected, run_plane_sweep_project
+from lsmgeo.functional.volume_sampling import Projected, run_plane_sweep_project, run_splat
 from lsmgeo.grids import FrustumGrid, VoxelGrid, check_constant_depths
 
-__all__ = ["PlaneSweepProject", "Unproject"]
+__all__ = ["PlaneSweepProject", "Splat", "Unproject"]
 
 
 def _as_given(name: str) -> Any:
@@ -33,10 +33,7 @@ class SamplingLayer(nn.Module):
 
     mode = _as_given("mode")
     padding_mode = _as_given("padding_mode")
-    augment = _as_given("augment")
-    direction_frame = _as_given("direction_frame")
     near = _as_given("near")
-    memory_format = _as_given("memory_format")
     backend = _as_given("backend")
 
     def __init__(self, who: str, smooth: str, **given: Any) -> None:
@@ -87,8 +84,11 @@ class Unproject(SamplingLayer):
         ((1, 3, 9, 8, 8, 8), (1, 3, 8, 8, 8))
     """
 
+    augment = _as_given("augment")
+    direction_frame = _as_given("direction_frame")
     reduce = _as_given("reduce")
     groups = _as_given("groups")
+    memory_format = _as_given("memory_format")
 
     def __init__(
         self,
@@ -141,7 +141,40 @@ class Unproject(SamplingLayer):
         return f"{self.grid}, {self._options_repr()}"
 
 
-class PlaneSweepProject(SamplingLayer):
+class SweepingLayer(SamplingLayer):
+    """A layer between volumes on a `VoxelGrid` and planes of depth in front of cameras; either may come with the call.
+
+    Neither is part of the ``state_dict``.
+    """
+
+    def __init__(self, who: str, grid: VoxelGrid | None, depths: Tensor | None, **given: Any) -> None:
+        if grid is not None and not isinstance(grid, VoxelGrid):
+            raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
+        if depths is not None:
+            check_constant_depths(who, depths, (1, 2, 3, 5))
+        super().__init__(who, "trilinear", **given)
+        self.grid = grid
+        self.depths = depths
+
+    def _lattice(self, source: Tensor, grid: VoxelGrid | None, depths: Tensor | None) -> tuple[VoxelGrid, Tensor]:
+        """The grid and depths of a call, which take precedence over the layer's, moved to the source's device."""
+        grid = self.grid if grid is None else grid
+        if grid is None:
+            raise GridError(f"{self.who}: grid must be given to the layer or to the call; got None")
+        if depths is None and self.depths is not None:
+            device = source.device if isinstance(source, Tensor) else self.depths.device
+            depths = moved(self.who, "depths", self.depths, device)
+        if depths is None:
+            raise GridError(f"{self.who}: depths must be given to the layer or to the call; got None")
+        return grid, depths
+
+    def extra_repr(self) -> str:
+        """The arguments."""
+        depths = None if self.depths is None else f"<{tuple(self.depths.shape)} {self.depths.dtype}>"
+        return f"{self.grid}, depths={depths}, {self._options_repr()}"
+
+
+class PlaneSweepProject(SweepingLayer):
     """Read a volume along the rays of cameras at planes of depth; see `lsmgeo.functional.plane_sweep_project`.
 
     Args:
@@ -176,7 +209,10 @@ class PlaneSweepProject(SamplingLayer):
         ((1, 3, 30, 12, 16), (1, 3, 6, 12, 16))
     """
 
+    augment = _as_given("augment")
+    direction_frame = _as_given("direction_frame")
     flatten = _as_given("flatten")
+    memory_format = _as_given("memory_format")
 
     def __init__(
         self,
@@ -193,16 +229,10 @@ class PlaneSweepProject(SamplingLayer):
         memory_format: torch.memory_format | None = None,
         backend: str = "auto",
     ) -> None:
-        who = "PlaneSweepProject"
-        if grid is not None and not isinstance(grid, VoxelGrid):
-            raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
-        if depths is not None:
-            check_constant_depths(who, depths, (1, 2, 3, 5))
-        if size is not None:
-            check_size(who, "size", size, 2, "(h, w)")
         super().__init__(
-            who,
-            "trilinear",
+            "PlaneSweepProject",
+            grid,
+            depths,
             mode=mode,
             padding_mode=padding_mode,
             augment=augment,
@@ -212,8 +242,8 @@ class PlaneSweepProject(SamplingLayer):
             memory_format=memory_format,
             backend=backend,
         )
-        self.grid = grid
-        self.depths = depths
+        if size is not None:
+            check_size(self.who, "size", size, 2, "(h, w)")
         self.size = size
 
     def forward(
@@ -227,18 +257,70 @@ class PlaneSweepProject(SamplingLayer):
         size: tuple[int, int] | None = None,
     ) -> Projected:
         """Sweep a volume (B, C, D, H, W); `grid`, `depths` and `size` take precedence over the layer's."""
-        grid = self.grid if grid is None else grid
-        if grid is None:
-            raise GridError("PlaneSweepProject: grid must be given to the layer or to the call; got None")
-        if depths is None and self.depths is not None:
-            device = volume.device if isinstance(volume, Tensor) else self.depths.device
-            depths = moved("PlaneSweepProject", "depths", self.depths, device)
-        if depths is None:
-            raise GridError("PlaneSweepProject: depths must be given to the layer or to the call; got None")
+        grid, depths = self._lattice(volume, grid, depths)
         size = self.size if size is None else size
         return run_plane_sweep_project(volume, cameras, grid, depths, size, view_mask, self.options)
 
     def extra_repr(self) -> str:
         """The arguments."""
-        depths = None if self.depths is None else f"<{tuple(self.depths.shape)} {self.depths.dtype}>"
-        return f"{self.grid}, depths={depths}, size={self.size}, {self._options_repr()}"
+        return f"{super().extra_repr()}, size={self.size}"
+
+
+class Splat(SweepingLayer):
+    """Add features along the rays of cameras to a volume, the adjoint of `PlaneSweepProject`.
+
+    See `lsmgeo.functional.splat` for equation and conventions.
+
+    Args:
+        grid: the `VoxelGrid` of the volume; None if it is passed to every call.
+        depths: (P,), (B, P), (B, V, P) or, for each pixel, (B, V, P, h, w), see `lsmgeo.depth_planes`; None if passed
+            to every call. Neither is part of the ``state_dict``; both follow the features' device.
+        mode: "trilinear" or "nearest".
+        padding_mode: "zeros" or "border".
+        near: least depth of a plane, world units.
+        backend: "auto", or the name of one.
+
+    Shape:
+        - features: (B, V, C, h, w) with weights (B, V, P, h, w), or (B, V, C, P, h, w) without.
+        - cameras: B*V, view fastest; view_mask: (B, V) bool.
+        - volume: (B, C, D, H, W).
+
+    Raises:
+        OptionError, DTypeError, GridError: at construction; for the rest see `lsmgeo.functional.splat`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import Splat, VoxelGrid, depth_planes
+        >>> from lsmgeo.cameras import orbit
+        >>> splat = Splat(VoxelGrid((1, 8, 8)), depth_planes(1.0, 3.0, 6), mode="nearest")
+        >>> cameras = orbit(torch.tensor([[0.0, 120.0, 240.0]]), 20.0, 2.0, focal_length=100.0, height=48, width=64)
+        >>> weights = torch.rand(1, 3, 6, 12, 16).softmax(2)
+        >>> tuple(splat(torch.rand(1, 3, 5, 12, 16), cameras, weights=weights).shape)
+        (1, 5, 1, 8, 8)
+    """
+
+    def __init__(
+        self,
+        grid: VoxelGrid | None = None,
+        depths: Tensor | None = None,
+        *,
+        mode: str = "trilinear",
+        padding_mode: str = "zeros",
+        near: float = 1e-6,
+        backend: str = "auto",
+    ) -> None:
+        super().__init__("Splat", grid, depths, mode=mode, padding_mode=padding_mode, near=near, backend=backend)
+
+    def forward(
+        self,
+        features: Tensor,
+        cameras: Cameras,
+        view_mask: Tensor | None = None,
+        *,
+        weights: Tensor | None = None,
+        grid: VoxelGrid | None = None,
+        depths: Tensor | None = None,
+    ) -> Tensor:
+        """Add features to a volume (B, C, D, H, W); `grid` and `depths` take precedence over the layer's."""
+        grid, depths = self._lattice(features, grid, depths)
+        return run_splat(features, cameras, grid, depths, weights, view_mask, self.options)

@@ -123,9 +123,9 @@ def splat(
 ) -> Tensor:
     """Add features along the rays of cameras to a volume: the adjoint of `plane_sweep_project`.
 
-    Equation: ``<plane_sweep_project(x), y> = <x, splat(y)>`` for every volume x and features y. Each feature is added to
-    the voxels that `plane_sweep_project` would interpolate between at its pixel and depth, with the same weights. With
-    depth probabilities as `weights` it is the lift and splat of Philion and Fidler, "Lift, Splat, Shoot", 2020.
+    Equation: ``<plane_sweep_project(x), y> = <x, splat(y)>`` for every volume x and features y. Each feature is added
+    to the voxels that `plane_sweep_project` would interpolate between at its pixel and depth, with the same weights.
+    With depth probabilities as `weights` it is the lift and splat of Philion and Fidler, "Lift, Splat, Shoot", 2020.
 
     Convention:
         Integer pixel centres; K is resized to the feature map. A sample in the outer half voxel fades; samples outside

@@ -332,11 +332,15 @@ class _Splat(_PlaneSweepProject):
     name, derivatives, answers = "splat", 4, "Tensor"
     schema = f"Tensor features, Tensor? weights, int[] shape, {_SITES}, {_OPTIONS}"
 
-    def forward(self, features: Tensor, weights: Tensor | None, shape: Sequence[int], *flat: Any) -> Tensor:
+    def forward(  # type: ignore[override]
+        self, features: Tensor, weights: Tensor | None, shape: Sequence[int], *flat: Any
+    ) -> Tensor:
         options = _options(flat)
         return KERNELS[options.backend].splat(features, _sites(flat), weights, shape, options)
 
-    def forward_fake(self, features: Tensor, weights: Tensor | None, shape: Sequence[int], *flat: Any) -> Tensor:
+    def forward_fake(  # type: ignore[override]
+        self, features: Tensor, weights: Tensor | None, shape: Sequence[int], *flat: Any
+    ) -> Tensor:
         B, _, C = features.shape[:3]
         return _empty(features, (B, C, *shape), (0, 2, 3, 4, 1), torch.float32)
 

@@ -15,6 +15,7 @@ from tests.kernels.comparison import (
     frustum_call,
     points_call,
     reduce_call,
+    splat_call,
     sweep_call,
     unproject_call,
     views_call,
@@ -84,6 +85,9 @@ WIDE, WIDE_VOLUME = (
     for source, axis in ((FEATURES, 2), (VOLUME, 1))
 )
 SWEEP = (VOLUME, VIEWS, GRID, DEPTHS, SIZE)
+SPLAT = (VIEWS, GRID, DEPTHS)
+MAPS, SHARES = _random(B, V, C, *SIZE), _random(B, V, 5, *SIZE)
+WIDE_MAPS, PLANE_MAPS = _random(B, V, 7 * C, *SIZE), _random(B, V, 3 * C, 5, *SIZE)
 
 CASES: dict[str, Callable[[str], None]] = {
     "bilinear": _case(unproject_call, FEATURES, VIEWS, GRID, **_both()),
@@ -135,6 +139,19 @@ CASES: dict[str, Callable[[str], None]] = {
     "correlation, statistics": _case(
         frustum_call, WIDE, *FRUSTUM, REFERENCE, groups=7, reduce=_EVERY, view_mask=MASK, **_both()
     ),
+    "splat": _case(splat_call, WIDE_MAPS, *SPLAT, SHARES, view_mask=MASK),
+    "splat, border": _case(splat_call, WIDE_MAPS, *SPLAT, SHARES, padding_mode="border", near=1.2),
+    "splat, nearest": _case(splat_call, MAPS, *SPLAT, SHARES, mode="nearest", near=1.2),
+    "splat, nearest, border": _case(
+        splat_call, MAPS, *SPLAT[:2], PIXEL_DEPTHS, SHARES[:, :, :4], mode="nearest", padding_mode="border"
+    ),
+    "splat of pixels' depths": _case(splat_call, WIDE_MAPS, *SPLAT[:2], PIXEL_DEPTHS, SHARES[:, :, :4]),
+    "splat, planes adjacent": _case(splat_call, WIDE_MAPS, *SPLAT, SHARES.movedim(2, -1).contiguous().movedim(-1, 2)),
+    "splat without weights": _case(splat_call, PLANE_MAPS, *SPLAT, view_mask=MASK),
+    "splat without weights, nearest": _case(
+        splat_call, PLANE_MAPS.movedim(3, -1).contiguous().movedim(-1, 3), *SPLAT, mode="nearest", padding_mode="border"
+    ),
+    "splat without weights, pixels' depths": _case(splat_call, PLANE_MAPS[:, :, :, :4], *SPLAT[:2], PIXEL_DEPTHS),
     "contiguous": _case(
         unproject_call, WIDE, VIEWS, GRID, reduce=("mean", "variance"), memory_format=torch.contiguous_format
     ),
@@ -153,6 +170,8 @@ HALF: dict[str, Callable[[str], None]] = {
         "correlation, mean": _case(
             frustum_call, WIDE.to(dtype), *FRUSTUM, PLANE_REFERENCES.to(dtype), groups=5, reduce="mean"
         ),
+        "splat": _case(splat_call, WIDE_MAPS.to(dtype), *SPLAT, SHARES.to(dtype)),
+        "splat without weights": _case(splat_call, PLANE_MAPS.to(dtype), *SPLAT, mode="nearest"),
         "small numbers": _case(unproject_call, (1e-5 * WIDE).to(dtype), VIEWS, GRID, padding_mode="border"),
     }.items()
 }
@@ -173,6 +192,7 @@ HALF |= {
     "correlation that saturates, mean": _case(
         frustum_call, LARGE, *FRUSTUM, (400.0 * REFERENCE).half(), groups=7, reduce="mean"
     ),
+    "splat that saturates": _case(splat_call, (4e4 * WIDE_MAPS).half(), *SPLAT, SHARES.half(), padding_mode="border"),
     "depth that saturates": _case(unproject_call, FEATURES.half(), FAR_VIEWS, FAR_GRID, **_both()),
     "swept depth that saturates": _case(
         sweep_call, VOLUME.half(), FAR_VIEWS, FAR_GRID, UNIT * DEPTHS, SIZE, flatten=False, **_both()
@@ -198,10 +218,12 @@ NEAREST = {
         ("pixels", views_call, (FEATURES, PIXELS, DISTANCE, VALID)),
         ("sweep", sweep_call, SWEEP),
         ("reduced sweep", reduce_call, (*SWEEP, WEIGHT, None)),
+        ("splat", splat_call, (MAPS, *SPLAT, SHARES)),
     )
     for augment in ("", "depth", "direction")
     for reduce in (None, "mean")
     if not (reduce and "sweep" in operator)
+    and not ((reduce or augment) and operator == "splat")
     and not (augment == "direction" and operator == "pixels")
     and not (augment and operator == "reduced sweep")
 }

@@ -88,10 +88,16 @@ FAULTS = {
     "own depth of a volume forgotten": ("grad_z[s] += per_site ? $grad_depth$ : -grad_depth", "0.0"),
     "matrix's gradient by the planes": ("to[2] += view.scale * (per_site ? $double(sum_z)$ :", "double(sum)"),
     "nearest of own depths passed over": ("range[1] = $std::max(range[1], tile.depth[s])$;", "range[0]"),
-    "correlation not a mean": ("const float share = $1.0f / float(size)$;\n    for (int64_t group", "1.0f"),
-    "reference of the first plane": ("channel * stride[1] + $tile.k$ * stride[2] + tile.j * stride[3]", "0"),
+    "correlation not a mean": ("const float share = $float(call.share)$;\n    for (int64_t group", "1.0f"),
+    "reference of the first plane": (
+        "Layout at = $layout(stride, tile)$;",
+        "Layout{layout(stride, tile).base - tile.k * stride[3], layout(stride, tile).site, stride[2]}",
+    ),
     "groups mixed up": ("*b = reference + $group * size$;", "0"),
-    "correlation's gradient not a mean": ("const float factor = $gradient[group] / float(size)$;", "gradient[group]"),
+    "correlation's gradient not a mean": (
+        "const float factor = $gradient[group] * float(call.share)$;",
+        "gradient[group]",
+    ),
     "last view's part of the reference's gradient": ("for (; c < end; c++) out[c] += $factor * other[c]$;", "0.0f"),
     "mean's share forgotten for correlations": (
         "workspace.value_gradients[group] = $gradient[group] * share$;",
@@ -101,6 +107,13 @@ FAULTS = {
         "$std::fabs(workspace.value_gradients[group]) <= limit ? gradient[group] : 0.0f$;",
         "gradient[group]",
     ),
+    "features of the last column": ("i = tile.i + ($tile.along_z ? 0 : s$);", "0"),
+    "features of the first view": ("tile.scene * stride[0] + $tile.view * stride[1]$ + k * stride[2]", "0"),
+    "splat without its weights": (
+        "factor + channel,\n                                      $gradient[0] * float(call.share)$);",
+        "1.0f",
+    ),
+    "sites outside with geometric channels passed over": ("if ($appended == 0$ && misses_volume", "true"),
     "gradient not cleared": ("if ($!call.source_gradient || call.accumulate$) return;", "true"),
     "bfloat16 cut off": ("$(bits + 0x7fff + (bits >> 16 & 1)) >> 16$;", "bits >> 16"),
     "float16 denormals lost": ("magnitude < (113u << 23) ? $small$ : normal", "0u"),

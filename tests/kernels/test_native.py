@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lsmgeo import FrustumGrid, functional, rays
-from lsmgeo._sites import image_sites, sweep_sites
+from lsmgeo._sites import image_sites, splat_sites, sweep_sites
 from lsmgeo.errors import BackendError
 from lsmgeo.kernels import Options, explain
 from lsmgeo.kernels.native import library, loading
@@ -205,7 +205,8 @@ def test_half_volumes_swept_into_float32():
 # opcheck looks at the gradients of tensors that have none.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 @pytest.mark.parametrize(
-    "operator", ["unproject", "correlation", "sample_views", "plane_sweep_project", "pixel_sweep", "project_reduce"]
+    "operator",
+    ["unproject", "correlation", "sample_views", "plane_sweep_project", "pixel_sweep", "project_reduce", "splat"],
 )
 def test_opcheck(operator):
     smooth = "bilinear" if operator in ("unproject", "correlation", "sample_views") else "trilinear"
@@ -220,6 +221,12 @@ def test_opcheck(operator):
         other = cases.REFERENCE[:, : cases.C].clone().requires_grad_()
         arguments = (leaf, other, *image_sites("test", leaf, cases.VIEWS, grid, cases.MASK, options, other))
         operator = "unproject"
+    elif operator == "splat":
+        leaf = cases.MAPS.clone().requires_grad_()
+        weights = cases.SHARES.clone().requires_grad_()
+        options = Options.checked("test", "trilinear").on("cpu")
+        sites = splat_sites("test", leaf, weights, cases.VIEWS, cases.GRID, cases.DEPTHS, cases.MASK, options)
+        arguments = (leaf, weights, cases.GRID.shape, *sites)
     else:
         depths = cases.PIXEL_DEPTHS.clone().requires_grad_() if operator == "pixel_sweep" else cases.DEPTHS
         sites = sweep_sites("test", leaf, cases.VIEWS, cases.GRID, depths, cases.SIZE, None, options)
@@ -248,6 +255,7 @@ def test_second_derivatives_are_those_of_the_reference():
         unproject_call(cases.FEATURES, cases.VIEWS, cases.GRID, near=0.1),
         sweep_call(cases.VOLUME, cases.VIEWS, cases.GRID, cases.DEPTHS, cases.SIZE),
         cases.points_call(cases.FEATURES, cases.VIEWS, cases.POINTS, augment="depth", reduce="mean"),
+        cases.splat_call(cases.MAPS, *cases.SPLAT, cases.SHARES),
         cases.views_call(cases.FEATURES, cases.PIXELS, cases.DISTANCE, cases.VALID, augment="depth"),
     ):
         for found, expected in zip(second(call, "cpu"), second(call, "reference"), strict=True):
@@ -345,7 +353,8 @@ def test_the_nearest_cell_depends_on_no_geometry_on_any_backend(name):
     assert offered[0] == offered[1]
     assert offered[0][0]
     if "depth" not in name and "direction" not in name:
-        assert offered[0] == [True, *(leaf.shape == cases.WEIGHT.shape for leaf in call.leaves[1:])]
+        factors = cases.WEIGHT.shape, cases.SHARES.shape
+        assert offered[0] == [True, *(leaf.shape in factors for leaf in call.leaves[1:])]
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import os
 import pytest
 import torch
 
-from lsmgeo.kernels.native import library as native
+from lsmgeo.kernels.native import loading as native
 from tests.kernels.cases import CASES, HALF
 from tests.kernels.native_faults import FAULTS, build, commit, compiler
 

@@ -14,11 +14,11 @@ from lsmgeo import cameras, errors, functional, fusion, grids, kernels, layers, 
 
 INVENTORY = {
     lsmgeo: {
-        "CameraTensors", "FrustumGrid", "PlaneSweepProject", "Unproject", "VoxelGrid", "__version__", "cameras",
-        "debug", "depth_planes", "errors", "functional", "fusion", "kernels", "rays",
+        "CameraTensors", "FrustumGrid", "PlaneSweepProject", "Splat", "Unproject", "VoxelGrid", "__version__",
+        "cameras", "debug", "depth_planes", "errors", "functional", "fusion", "kernels", "rays",
     },
     functional: {
-        "Projected", "Unprojected", "plane_sweep_project", "sample_views", "unproject", "unproject_points",
+        "Projected", "Unprojected", "plane_sweep_project", "sample_views", "splat", "unproject", "unproject_points",
         "unproject_slabs", "view_statistics",
     },
     cameras: {
@@ -27,7 +27,7 @@ INVENTORY = {
         "to_opengl", "to_pytorch3d", "unproject_depth",
     },
     grids: {"FrustumGrid", "Lattice", "VoxelGrid", "depth_planes"},
-    layers: {"PlaneSweepProject", "Unproject"},
+    layers: {"PlaneSweepProject", "Splat", "Unproject"},
     fusion: {"ConvGRU3d", "ConvLSTM3d", "Max", "Mean", "Variance"},
     rays: {"Composited", "ProjectReduce", "composite", "expected_depth", "max_along_rays", "project_reduce"},
     metrics: {
@@ -60,6 +60,12 @@ SIGNATURES = {
     ),
     lsmgeo.Unproject.forward: "(self, features, cameras, view_mask=None, *, grid=None, reference=None)",
     lsmgeo.PlaneSweepProject.forward: "(self, volume, cameras, view_mask=None, *, grid=None, depths=None, size=None)",
+    lsmgeo.Splat: "(grid=None, depths=None, *, mode='trilinear', padding_mode='zeros', near=1e-06, backend='auto')",
+    lsmgeo.Splat.forward: ("(self, features, cameras, view_mask=None, *, weights=None, grid=None, depths=None)"),
+    functional.splat: (
+        "(features, cameras, grid, depths, *, weights=None, view_mask=None, mode='trilinear', padding_mode='zeros', "
+        "near=1e-06, backend='auto')"
+    ),
     functional.unproject: (
         f"(features, cameras, grid, *, view_mask=None, mode='bilinear', padding_mode='zeros', {SAMPLING}, reduce=None, "
         "near=1e-06, reference=None, groups=1, memory_format=None, backend='auto')"

@@ -332,9 +332,7 @@ def plane_sweep_project_backward(
     return _lattice_backward(PLANE_SWEEP_PROJECT, gradient, source, sites, options, (*needs, False), into=into)[:-1]
 
 
-def splat(
-    features: Tensor, sites: Sites, weights: Tensor | None, shape: Sequence[int], options: Options
-) -> Tensor:
+def splat(features: Tensor, sites: Sites, weights: Tensor | None, shape: Sequence[int], options: Options) -> Tensor:
     """As `reference.splat`: the transpose of `plane_sweep_project`, where weights times that of a correlation."""
     B, channel = features.shape[0], features.shape[2]
     # In place of the volume, which is not read: any memory of its shape.

@@ -130,6 +130,7 @@ def empty(shape: Sequence[int], dtype: torch.dtype, order: Sequence[int] | None 
 
 
 def run(call: Call, backward: bool) -> None:
+    """Run a call; the tensors that it names must be alive."""
     library = _library()
     assert not isinstance(library, str), library
     failed = (library.lsmgeo_backward if backward else library.lsmgeo_forward)(ctypes.byref(call))

@@ -17,12 +17,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lsmgeo._dtypes import saturating_cast
 from lsmgeo._torch_compat import has_forward_derivatives, has_function_transforms, is_exporting, is_jit_traced
 from lsmgeo.kernels import reference
 from lsmgeo.kernels.lattice_geometry import pixels_in_front, project_points
 from lsmgeo.kernels.native import library
 from lsmgeo.kernels.project_reduce import project_reduce, project_reduce_backward
 from lsmgeo.kernels.request import Options, Sites
+from lsmgeo.kernels.splat import splat, splat_backward
 from lsmgeo.kernels.triton import operators as triton_operators
 
 __all__ = ["KERNELS", "operators", "why_not"]
@@ -336,7 +338,7 @@ class _Splat(_PlaneSweepProject):
         self, features: Tensor, weights: Tensor | None, shape: Sequence[int], *flat: Any
     ) -> Tensor:
         options = _options(flat)
-        return KERNELS[options.backend].splat(features, _sites(flat), weights, shape, options)
+        return splat(KERNELS[options.backend], features, _sites(flat), weights, shape, options)
 
     def forward_fake(  # type: ignore[override]
         self, features: Tensor, weights: Tensor | None, shape: Sequence[int], *flat: Any
@@ -349,8 +351,11 @@ class _Splat(_PlaneSweepProject):
     ) -> tuple[Tensor, ...]:
         *flat, needs = rest
         options = _options(flat)
-        backward = KERNELS[options.backend].splat_backward
-        return _tensors(gradient, backward(gradient, features, _sites(flat), weights, options, needs), needs)
+        sites, kernels = _sites(flat), KERNELS[options.backend]
+        to_features, to_weights, *to_sites = splat_backward(kernels, gradient, features, sites, weights, options, needs)
+        to_features = None if to_features is None else saturating_cast(to_features, features.dtype)
+        to_weights = None if to_weights is None else saturating_cast(to_weights, features.dtype)
+        return _tensors(gradient, (to_features, to_weights, *to_sites), needs)
 
     def backward_fake(
         self, gradient: Tensor, features: Tensor, weights: Tensor | None, shape: Sequence[int], *flat: Any

@@ -87,7 +87,7 @@ WIDE, WIDE_VOLUME = (
 SWEEP = (VOLUME, VIEWS, GRID, DEPTHS, SIZE)
 SPLAT = (VIEWS, GRID, DEPTHS)
 MAPS, SHARES = _random(B, V, C, *SIZE), _random(B, V, 5, *SIZE)
-WIDE_MAPS, PLANE_MAPS = _random(B, V, 7 * C, *SIZE), _random(B, V, 3 * C, 5, *SIZE)
+WIDE_MAPS, PLANE_MAPS = _random(B, V, 4 * C, *SIZE), _random(B, V, 3 * C, 5, *SIZE)
 
 CASES: dict[str, Callable[[str], None]] = {
     "bilinear": _case(unproject_call, FEATURES, VIEWS, GRID, **_both()),

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from lsmgeo.kernels import Options, Sites
-from lsmgeo.kernels.triton import launcher
+from lsmgeo.kernels.splat import splat, splat_backward
+from lsmgeo.kernels.triton import launcher, operators
 from tests.kernels.triton_support import Points, by_kernels, deterministic
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
@@ -126,4 +127,16 @@ def test_compiles_for_hopper(compiled, variant):
     for kernel in compiled:
         assert len(kernel.asm["cubin"]) > 1000
         assert ".target sm_90" in kernel.asm["ptx"]
+        assert ".f64" not in kernel.asm["ptx"]
+
+
+@pytest.mark.parametrize("variant", ["splat"])
+def test_splat_compiles_for_hopper(compiled, variant):
+    maps, weights = torch.zeros(B, V, C, *SIZE), torch.zeros(B, V, P, *SIZE)
+    arguments = maps, sites(projective=True), weights
+    splat(operators, *arguments, VOLUME.shape[2:], Options("trilinear"))
+    splat_backward(operators, VOLUME, *arguments, Options("trilinear"), (True,) * 4)
+    assert [kernel.src.fn.__name__ for kernel in compiled] == ["resample_backward", "resample", "resample_backward"]
+    for kernel in compiled:
+        assert len(kernel.asm["cubin"]) > 1000
         assert ".f64" not in kernel.asm["ptx"]

@@ -13,7 +13,7 @@ from unittest import mock
 import torch
 from torch import Tensor
 
-from lsmgeo import FrustumGrid, _sites
+from lsmgeo import FrustumGrid, _sites, functional
 from lsmgeo.kernels import reference
 from lsmgeo.kernels.request import Options
 from lsmgeo.kernels.triton import launcher, operators
@@ -440,10 +440,24 @@ def deterministic_sums() -> None:
 SHARED = [
     name
     for name in shared.CASES
-    if name.startswith(("depths of pixels", "sweep of pixels", "correlation", "contiguous"))
+    if name.startswith(("depths of pixels", "sweep of pixels", "correlation", "contiguous", "splat"))
+    and name not in ("splat, border", "splat, nearest", "splat, planes adjacent")
 ]
 CASES |= {f"shared, {name}": partial(shared.CASES[name], "triton") for name in SHARED}
 CASES["shared, half"] = partial(shared.HALF["correlation that saturates"], "triton")
+CASES["shared, splat in half precision"] = partial(shared.HALF["splat, float16"], "triton")
+
+
+@case
+def deterministic_splats() -> None:
+    """The same bits from run to run, and integers exactly."""
+    features, weights = shared.MAPS.mul(16).round(), shared.SHARES.mul(8).round()
+    call = partial(functional.splat, features, *shared.SPLAT, weights=weights, mode="nearest")
+    with deterministic():
+        found = [call(backend="triton") for _ in range(2)]
+    assert torch.equal(*found)
+    assert torch.equal(found[0], call(backend="reference"))
+    assert found[0].any()
 
 
 @case

@@ -46,6 +46,7 @@ COMPARISONS: dict[str, Callable[[], object]] = {
     "own depths": partial(shared.CASES["depths of pixels"], "triton"),
     "own sweep": partial(shared.CASES["sweep of pixels' depths"], "triton"),
     "correlation": partial(shared.CASES["correlation, groups"], "triton"),
+    "splat": partial(shared.CASES["splat, nearest, border"], "triton"),
     "sweep": lambda: compare_sweep(volumes(2), sweep_sites(25), Options("trilinear", "border", depth=True, near=0.6)),
 }
 
@@ -136,7 +137,15 @@ CHANGES = {
         GRADIENTS, "to_depth += grad_z * _clamped", "to_depth += 0.0 * _clamped", "own sweep"
     ),
     "sums in another order": Fault(TABLES, "columns = [0, 1, 3, 2]", "columns = [0, 1, 2, 3]", "own depths"),
-    "correlation not a mean": Fault(KERNELS, "n), LARGEST) / size", "n), LARGEST)", "correlation"),
+    "correlation not a mean": Fault(
+        KERNELS, "product / size if CONFIG.averages", "product if CONFIG.averages", "correlation"
+    ),
+    "features of the first view": Fault(
+        KERNELS, "start, mask = _view_start(lattice.reference, view, n)", "start, mask = view * 0", "splat"
+    ),
+    "gradient to the features of another view": Fault(
+        GRADIENTS, "_addresses(array, _view_start(array, view, n)", "_addresses(array, view * 0", "splat"
+    ),
     "groups mixed up": Fault(KERNELS, "channel // size == group", "channel % n.features == group", "correlation"),
     "reference's gradient without its weight": Fault(
         GRADIENTS, "addresses, each * sampled", "addresses, sampled", "correlation"

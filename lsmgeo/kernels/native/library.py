@@ -311,10 +311,16 @@ def sample_views_backward(
 
 
 def plane_sweep_project(
-    source: Tensor, sites: Sites, options: Options, out: Tensor | None = None
+    source: Tensor, sites: Sites, options: Options, out: Tensor | None = None, factor: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """As `reference.plane_sweep_project`; `out` is memory of the values' shape, any strides, to write to."""
-    return _forward(*_lattice_call(PLANE_SWEEP_PROJECT, source, sites, options), source.dtype, options, out)
+    """As `reference.plane_sweep_project`; `out` is memory of the values' shape, any strides, to write to.
+
+    With a `factor` (B, V, C, 1, h, w) the one channel is the sum of its products with the samples.
+    """
+    call, alive = _lattice_call(PLANE_SWEEP_PROJECT, source, sites, options)
+    if factor is not None:
+        _set_reference(call, factor, 1, share=1.0)
+    return _forward(call, (*alive, factor), source.dtype, options, out)
 
 
 def plane_sweep_project_backward(
@@ -324,65 +330,13 @@ def plane_sweep_project_backward(
     options: Options,
     needs: Sequence[bool],
     into: Tensor | None = None,
-) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """Vector-Jacobian product of `plane_sweep_project` to source, matrix, direction and z, see `unproject_backward`.
+    factor: Tensor | None = None,
+) -> tuple[Tensor | None, ...]:
+    """Vector-Jacobian product of `plane_sweep_project` to source, matrix, direction, z, and factor if in `needs`.
 
-    `into` is float32 memory of the source's shape, channels next to one another, to add its gradient to.
+    See `unproject_backward`. `into` is float32 memory of the source's shape, channels adjacent, to add its gradient to.
     """
-    return _lattice_backward(PLANE_SWEEP_PROJECT, gradient, source, sites, options, (*needs, False), into=into)[:-1]
-
-
-def splat(features: Tensor, sites: Sites, weights: Tensor | None, shape: Sequence[int], options: Options) -> Tensor:
-    """As `reference.splat`: the transpose of `plane_sweep_project`, where weights times that of a correlation."""
-    B, channel = features.shape[0], features.shape[2]
-    # In place of the volume, which is not read: any memory of its shape.
-    volume = torch.empty(channel, dtype=torch.float32).expand(B, *shape, channel).movedim(-1, 1)
-    values, factor = _factors(features, weights)
-    needs = True, False, False, False, False
-    total, *_ = _lattice_backward(PLANE_SWEEP_PROJECT, values, volume, sites, options, needs, factor, share=1.0)
-    return total  # type: ignore[return-value]
-
-
-def _factors(features: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """What is added at the sites, (B, V, C or 1, P, h, w), and (B, V, C, 1, h, w) to multiply it with."""
-    if weights is None:
-        return features, None
-    return weights[:, :, None].float(), channels_last(features, 2).float()[:, :, :, None]
-
-
-def splat_backward(
-    gradient: Tensor,
-    features: Tensor,
-    sites: Sites,
-    weights: Tensor | None,
-    options: Options,
-    needs: Sequence[bool],
-) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """Vector-Jacobian product of `splat` to features, weights, matrix and z, None where not in `needs`.
-
-    The gradient is float32. Those to features and weights have their dtype; others as those of `unproject_backward`.
-    """
-    of_features, of_weights, of_matrix, of_z = needs
-    gradient = channels_last(gradient, 1)
-    values, factor = _factors(features, weights)
-    to_features = to_weights = None
-    if of_weights if weights is not None else of_features:
-        call, alive = _lattice_call(PLANE_SWEEP_PROJECT, gradient, sites, options)
-        if factor is not None:
-            _set_reference(call, factor, 1, share=1.0)
-        found, _ = _forward(call, (*alive, factor), features.dtype, options)
-        if weights is None:
-            to_features = found
-        else:
-            to_weights = found[:, :, 0]
-    of_factor = of_features and factor is not None
-    if of_factor or of_matrix or of_z:
-        wanted = False, of_matrix, False, of_z, of_factor
-        _, to_matrix, _, to_z, to_factor = _lattice_backward(
-            PLANE_SWEEP_PROJECT, values, gradient, sites, options, wanted, factor, share=1.0
-        )
-    else:
-        to_matrix = to_z = to_factor = None
-    if to_factor is not None:
-        to_features = saturating_cast(to_factor[:, :, :, 0], features.dtype)
-    return to_features, to_weights, to_matrix, to_z
+    every = (*needs, False)[:5]
+    share = None if factor is None else 1.0
+    found = _lattice_backward(PLANE_SWEEP_PROJECT, gradient, source, sites, options, every, factor, into, share)
+    return found[: len(needs)]

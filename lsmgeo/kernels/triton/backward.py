@@ -139,12 +139,12 @@ def _correlation_gradients(grad, source, into, lattice, view, projection, site, 
         channel, exists = _chunk(number, n, CONFIG)
         each = tl.zeros([CONFIG.sites, CONFIG.channels], tl.float32)
         for group in range(n.features):
-            part = tl.sum(tl.where(column == group, grad, 0.0), 1) / size
+            part = tl.sum(tl.where(column == group, grad, 0.0), 1)
+            part = part / size if CONFIG.averages else part
             each += tl.where((channel // size == group)[None, :], part[:, None], 0.0)
         if CONFIG.needs_reference:
             array = into.reference
-            start = (view // n.views) * array.b
-            addresses = _addresses(array, start, site.k, site.j, site.i, channel)
+            addresses = _addresses(array, _view_start(array, view, n), site.k, site.j, site.i, channel)
             sampled = _sampled(source, view, projection, channel, exists, n, CONFIG)
             _scatter(
                 array, into.reference_scale, addresses, each * sampled, projection.front[:, None] & exists[None, :]

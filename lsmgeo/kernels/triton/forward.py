@@ -277,7 +277,7 @@ def _sampled(source, view, projection, channel, exists, n, CONFIG: tl.constexpr)
 @triton.jit
 def _reference(lattice, view, projection, site, channel, exists, n):
     """The reference's channels (sites, channels) at the sites in front."""
-    start, mask = (view // n.views) * lattice.reference.b, projection.front[:, None] & exists[None, :]
+    start, mask = _view_start(lattice.reference, view, n), projection.front[:, None] & exists[None, :]
     addresses = _addresses(lattice.reference, start, site.k, site.j, site.i, channel)
     return tl.load(addresses, mask=mask, other=0.0).to(tl.float32)
 
@@ -290,13 +290,14 @@ def _chunk(number, n, CONFIG: tl.constexpr):
 
 @triton.jit
 def _correlations(source, lattice, view, projection, site, n, CONFIG: tl.constexpr):
-    """Means over groups of channels of reference times sample, (sites, groups)."""
+    """Means, or sums, over groups of channels of reference times sample, (sites, groups)."""
     column, size = tl.arange(0, CONFIG.columns)[None, :], tl.maximum(n.channels // n.features, 1)
     values = tl.zeros([CONFIG.sites, CONFIG.columns], tl.float32)
     for number in range(n.chunks):
         channel, exists = _chunk(number, n, CONFIG)
         product = _sampled(source, view, projection, channel, exists, n, CONFIG)
-        product = _clamp(product * _reference(lattice, view, projection, site, channel, exists, n), LARGEST) / size
+        product = _clamp(product * _reference(lattice, view, projection, site, channel, exists, n), LARGEST)
+        product = product / size if CONFIG.averages else product
         for group in range(n.features):
             share = tl.sum(tl.where((channel // size == group)[None, :], product, 0.0), 1)
             values += tl.where(column == group, share[:, None], 0.0)

@@ -56,6 +56,7 @@ def plan(
     needs: tuple[bool, bool] = (False, False),
     reference: Tensor | None = None,
     needs_reference: bool = False,
+    averages: bool = True,
 ) -> Call:
     """Choose the tiles of a launch.
 
@@ -68,8 +69,9 @@ def plan(
         points: pixels, front and geometric channels of given pixels.
         volume: whether the source is a volume.
         needs: whether the gradients to the source and to the geometry are needed.
-        reference: (B, C, D or 1, H, W), to correlate the samples with.
+        reference: (B, V or 1, C, D or 1, H, W), to correlate the samples with.
         needs_reference: whether the gradient to it is needed.
+        averages: whether a correlation is a mean over its channels, not their sum.
     """
     types = _types()
     views, channels = source.shape[1:3]
@@ -113,6 +115,7 @@ def plan(
         needs_reference=needs_reference,
         per_site=lattice is not None and lattice.depths is not None,
         correlates=reference is not None,
+        averages=averages,
     )
     cells = source.shape[3:]
     depths = None if lattice is None or lattice.depths is None else strided(lattice.depths)
@@ -152,14 +155,15 @@ def strided(array: Tensor) -> Any:
 
 
 def strided_reference(reference: Tensor) -> Any:
-    """A (B, C, D or 1, H, W) array for a kernel, the same for all planes where it has one."""
-    b, c, z, y, x = reference.stride()
-    return _types().Strided(reference, b, 0, c, z if reference.shape[2] > 1 else 0, y, x)
+    """A (B, V or 1, C, D or 1, H, W) array for a kernel, the same for all views or planes where it has one."""
+    b, v, c, z, y, x = reference.stride()
+    shared = reference.shape[1] == 1, reference.shape[3] == 1
+    return _types().Strided(reference, b, 0 if shared[0] else v, c, 0 if shared[1] else z, y, x)
 
 
 def into_of(source: Tensor, scale: Tensor | None, reference: Accumulator | None) -> Any:
     """The `types.Into` of a backward."""
-    other = (None, None) if reference is None else (strided_reference(reference.array[:, 0]), reference.scale)
+    other = (None, None) if reference is None else (strided_reference(reference.array), reference.scale)
     return _types().Into(strided(source), scale, *other)
 
 

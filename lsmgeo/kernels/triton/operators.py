@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -82,7 +83,8 @@ def unproject(source: Tensor, sites: Sites, reference: Tensor | None, options: O
     channels = ((C if reference is None else options.groups) + options.appended()) * max(1, len(options.reduce))
     shape = B, 1 if options.reduce else V, channels, *sites.counts()
     out = source.new_empty(shape) if options.contiguous else empty_channels_last(*shape, like=source)
-    visible = _forward(source.unsqueeze(3), out, options, options.appended(), sites, reference=reference)
+    other = None if reference is None else reference[:, None]
+    visible = _forward(source.unsqueeze(3), out, options, options.appended(), sites, reference=other)
     return _without_views(out, options), visible
 
 
@@ -100,11 +102,12 @@ def unproject_backward(
     The gradient may have any strides. Those to source and reference have their dtype; those to matrices (B, V, 3, 4)
     and z (B, V, D) are float64; that to the depths of each site is float32, of their shape.
     """
+    other = None if reference is None else reference[:, None]
     found = _lattice_backward(
-        _with_views(gradient, options), source.unsqueeze(3), sites, options, needs, False, reference=reference
+        _with_views(gradient, options), source.unsqueeze(3), sites, options, needs, False, reference=other
     )
     to_source = None if found[0] is None else saturating_cast(found[0].squeeze(3), source.dtype)
-    to_reference = None if found[4] is None else saturating_cast(found[4], source.dtype)
+    to_reference = None if found[4] is None else saturating_cast(found[4][:, 0], source.dtype)
     return to_source, *found[1:4], to_reference
 
 
@@ -113,20 +116,24 @@ def _lattice_backward(
     source: Tensor,
     sites: Sites,
     options: Options,
-    needs: tuple[bool, bool, bool, bool, bool],
+    needs: Sequence[bool],
     volume: bool,
     given: Tensor | None = None,
     reference: Tensor | None = None,
+    averages: bool = True,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """Gradients to a (B, V or 1, C, d, h, w) source, in float32, to the geometry, and to the reference, in float32."""
+    """Gradients to a (B, V or 1, C, d, h, w) source, in float32, to the geometry, and to the reference, in float32.
+
+    The reference is (B, V or 1, C, D or 1, H, W).
+    """
     wanted, of_reference = (needs[0], any(needs[1:4])), needs[4]
     planes, *pixels = gradient.shape[3:]
     count = planes * math.prod(pixels) * (source.shape[1] if volume else 1)
     into = accumulator(gradient, source, options, count, volume, given, reference) if needs[0] else None
     other = None
     if reference is not None and of_reference:
-        adds = source.shape[1] * (planes if reference.shape[2] == 1 else 1)
-        other = accumulator(gradient, reference[:, None], options, adds, False, factor=source)
+        adds = (source.shape[1] if reference.shape[1] == 1 else 1) * (planes if reference.shape[3] == 1 else 1)
+        other = accumulator(gradient, reference, options, adds, False, factor=source)
     if count:
         known = tables(sites, options, volume)
         call = plan(
@@ -139,6 +146,7 @@ def _lattice_backward(
             needs=wanted,
             reference=reference,
             needs_reference=of_reference,
+            averages=averages,
         )
         sums = allocate_sums(call, options, wanted[1], source)
         _launch_backward(call, gradient, source, into, sums, other)
@@ -160,7 +168,7 @@ def _lattice_backward(
         matrix if needs[1] else None,
         direction if needs[2] else None,
         z if needs[3] else None,
-        None if other is None else other.total()[:, 0],
+        None if other is None else other.total(),
     )
 
 
@@ -234,13 +242,14 @@ def sample_views_backward(
 
 @torch.no_grad()
 def plane_sweep_project(
-    source: Tensor, sites: Sites, options: Options, out: Tensor | None = None
+    source: Tensor, sites: Sites, options: Options, out: Tensor | None = None, factor: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """As `reference.plane_sweep_project`; `out` is memory of the maps' shape, any strides, to write to.
 
     Otherwise memory is [B][V][h][w][C'][P] with `options.flatten`, else [B][V][P][h][w][C'].
+    With a `factor` (B, V, C, 1, h, w) the one channel is the sum of its products with the samples.
     """
-    (B, C), V = source.shape[:2], sites.matrix.shape[1]
+    B, V, C = source.shape[0], sites.matrix.shape[1], source.shape[1] if factor is None else 1
     channels, (P, h, w) = C + options.appended(), sites.counts()
     if out is None and options.contiguous:
         out = source.new_empty(B, V, channels, P, h, w)
@@ -249,7 +258,8 @@ def plane_sweep_project(
     elif out is None:
         out = empty_channels_last(B, V, channels, P, h, w, like=source)
     views = _per_view(source, V)
-    return out, _forward(views, out, options, options.appended(), sites, volume=True)
+    planned = {"volume": True, "reference": factor, "averages": False}
+    return out, _forward(views, out, options, options.appended(), sites, **planned)
 
 
 def _per_view(source: Tensor, V: int) -> Tensor:
@@ -263,20 +273,24 @@ def plane_sweep_project_backward(
     source: Tensor,
     sites: Sites,
     options: Options,
-    needs: tuple[bool, bool, bool, bool],
+    needs: Sequence[bool],
     into: Tensor | None = None,
-) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
-    """Vector-Jacobian product of `plane_sweep_project`, as `unproject_backward`.
+    factor: Tensor | None = None,
+) -> tuple[Tensor | None, ...]:
+    """Vector-Jacobian product of `plane_sweep_project` to source, matrix, direction, z, and factor if in `needs`.
 
     `into` is float32 memory of the source's shape: the source's gradient is added to it, and it is returned.
     """
     views = _per_view(source, sites.matrix.shape[1])
     given = None if into is None else into[:, None]
-    total, matrix, direction, z, _ = _lattice_backward(gradient, views, sites, options, (*needs, False), True, given)
+    every = (*needs, False)[:5]
+    total, *others = _lattice_backward(gradient, views, sites, options, every, True, given, factor, False)
     if total is None:
         found = None
     elif into is None:
         found = saturating_cast(total[:, 0], source.dtype)
     else:
         found = into if total is given else into.add_(total[:, 0])
-    return found, matrix, direction, z
+    if len(needs) == 5 and others[3] is not None:
+        others[3] = saturating_cast(others[3], factor.dtype)  # type: ignore[union-attr]
+    return (found, *others)[: len(needs)]

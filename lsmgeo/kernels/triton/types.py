@@ -134,6 +134,7 @@ class Config(NamedTuple):
     needs_reference: bool = False
     per_site: bool = False  # whether each site has its own depth
     correlates: bool = False
+    averages: bool = True  # whether a correlation is a mean over its channels, not their sum
 
 
 class Site(NamedTuple):

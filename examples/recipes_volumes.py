@@ -9,13 +9,34 @@ from torch import Tensor
 
 from lsmgeo import Unproject, VoxelGrid
 from lsmgeo.cameras import CameraTensors, project, resize
-from lsmgeo.functional import sample_views, unproject_points
+from lsmgeo.functional import sample_views, splat, unproject_points
 
 
 def scaled(cameras: CameraTensors, x: float, y: float, size: tuple[int, int]) -> CameraTensors:
     """Cameras of a map of `size` (h, w) whose pixel (x u, y v) is the image's (u, v), as many originals do."""
     scale = cameras.intrinsics.new_tensor([x, y, 1.0])
     return CameraTensors(scale[:, None] * cameras.intrinsics, cameras.cam_from_world, *size)
+
+
+def lift_splat(features: Tensor, logits: Tensor, cameras: CameraTensors, grid: VoxelGrid, depths: Tensor) -> Tensor:
+    """Lift-Splat: features times depth probabilities, the softmax of logits (B, V, P, h, w), summed in each voxel."""
+    volume = splat(features, cameras, grid, depths, weights=logits.softmax(2), mode="nearest")
+    return volume.transpose(1, 2).flatten(1, 2)  # (B, D C, H, W), height in the channels
+
+
+def lift_splat_as_published(
+    features: Tensor, logits: Tensor, cameras: CameraTensors, grid: VoxelGrid, depths: Tensor
+) -> Tensor:
+    """Lift-Splat as its own code computes it: the corners of map and image coincide, and indices truncate toward 0."""
+    h, w = features.shape[-2:]
+    views = scaled(cameras, (w - 1) / (cameras.width - 1), (h - 1) / (cameras.height - 1), (h, w))
+    lower = [low - (high - low) / n for low, high, n in zip(grid.lower, grid.upper, grid.shape[::-1], strict=True)]
+    wider = VoxelGrid([n + 1 for n in grid.shape], lower, grid.upper, grid.world_from_grid)
+    volume = splat(features, views, wider, depths, weights=logits.softmax(2), mode="nearest")
+    for axis in (2, 3, 4):  # the first cell takes the samples of the one below it
+        below, first, others = volume.tensor_split([1, 2], axis)
+        volume = torch.cat((below + first, others), axis)
+    return volume.transpose(1, 2).flatten(1, 2)
 
 
 def bevformer_attention(

@@ -31,11 +31,15 @@ SIZE = tuple(FEATURES.shape[-2:])
 B, V, C = FEATURES.shape[:3]
 GRID = VoxelGrid((4, 3, 6), (-0.6, -0.5, -0.7), (0.5, 0.45, 0.65), cases.POSE.double())
 SITES = GRID.centers().reshape(-1, 3).numpy()
+DEPTHS = torch.linspace(0.9, 2.4, 8, dtype=torch.float64)
 GENERATOR = torch.Generator().manual_seed(5)
 
 
 def random(*shape):
     return torch.rand(*shape, dtype=torch.float64, generator=GENERATOR)
+
+
+LOGITS = 4 * random(B, V, len(DEPTHS), *SIZE)
 
 
 def sampled(points, **options):
@@ -74,6 +78,47 @@ def read_by_rounding(points):
 
 def scaled_cameras():
     return recipes.scaled(CAMERAS, SIZE[1] / IMAGE[1], SIZE[0] / IMAGE[0], SIZE)
+
+
+def pooled(sites, to_cell):
+    """Lift-Splat by hand, (B, D C, H, W); `sites` (b, v) gives points (P h w, 3), `to_cell` the cell x, y, z of one."""
+    weights = LOGITS.softmax(2).numpy()
+    found = np.zeros((B, GRID.shape[0], C, *GRID.shape[1:]))
+    for b, v in np.ndindex(B, V):
+        for n, point in enumerate(sites(b, v)):
+            k, j, i = np.unravel_index(n, weights.shape[2:])
+            x, y, z = to_cell(point)
+            if 0 <= x < found.shape[4] and 0 <= y < found.shape[3] and 0 <= z < found.shape[1]:
+                found[b, z, :, y, x] += weights[b, v, k, j, i] * FEATURES[b, v, :, j, i].numpy()
+    return found.reshape(B, -1, *GRID.shape[1:])
+
+
+def test_lift_splat():
+    inverse = np.linalg.inv(GRID.world_from_lattice.numpy())
+    found = recipes.lift_splat(FEATURES, LOGITS, CAMERAS, GRID, DEPTHS)
+    expected = pooled(
+        lambda b, v: oracle.frustum_sites((K[b, v], R[b, v], T[b, v]), IMAGE, DEPTHS.numpy(), SIZE).reshape(-1, 3),
+        lambda point: np.floor(inverse[:3] @ (*point, 1.0) + 0.5).astype(int),
+    )
+    assert found.shape == expected.shape
+    close(found, expected)
+
+
+def test_lift_splat_as_published():
+    grid = VoxelGrid(GRID.shape, GRID.lower, GRID.upper)
+    lower, step = np.array(grid.lower), (np.array(grid.upper) - grid.lower) / grid.shape[::-1]
+
+    def sites(b, v):
+        rows, columns = np.linspace(0, IMAGE[0] - 1, SIZE[0]), np.linspace(0, IMAGE[1] - 1, SIZE[1])
+        pixels = np.array([(u, v) for v in rows for u in columns])
+        return np.concatenate([oracle.backproject(K[b, v], R[b, v], T[b, v], pixels, np.full(70, d)) for d in DEPTHS])
+
+    cameras = CAMERAS._replace(height=IMAGE[0], width=IMAGE[1])
+    found = recipes.lift_splat_as_published(FEATURES, LOGITS, cameras, grid, DEPTHS)
+    expected = pooled(sites, lambda point: np.trunc((point - lower) / step).astype(int))
+    close(found, expected)
+    rounded_down = pooled(sites, lambda point: np.floor((point - lower) / step).astype(int))
+    assert np.abs(rounded_down - expected).max() > 0.1
 
 
 def test_bevformer_attention():
@@ -165,7 +210,7 @@ def test_pixelnerf_inputs():
 def test_recipes_are_short_and_shown():
     page = (ROOT / "docs" / "recipes_volumes.rst").read_text(encoding="utf-8")
     functions = [node for node in ast.parse(PATH.read_text(encoding="utf-8")).body if isinstance(node, ast.FunctionDef)]
-    assert len(functions) == 7
+    assert len(functions) == 9
     for function in functions:
         first = function.body[1].lineno  # after the docstring
         assert function.end_lineno - first + 1 <= 10, function.name

@@ -8,6 +8,7 @@ ORDER = [
     "plot_plane_sweep_sphere.py",
     "plot_plane_sweep_stereo.py",
     "plot_depth_range.py",
+    "plot_birds_eye_view.py",
     "plot_visual_hull.py",
     "plot_pose_noise.py",
     "plot_analytic_scene.py",

@@ -74,6 +74,15 @@ def test_planes_a_pixel_apart_are_nearly_enough_and_depths_out_of_range_are_lost
     assert lost["ten times too wide, 75 planes"] < 1.2 * least
 
 
+def test_splatted_cars_stay_where_they_are_while_the_depth_is_known(run):
+    names = run("birds_eye_view")
+    assert names["scores"]["splatted"] > 0.55 > 0.3 > names["scores"]["lifted"]
+    assert names["hidden"] > 0.8
+    overlaps = names["overlaps"]
+    assert overlaps[1:] == sorted(overlaps[1:], reverse=True)
+    assert overlaps[3] > 2 * names["scores"]["lifted"] > 2 * overlaps[-1]
+
+
 def test_a_hull_nears_the_filled_cup_and_never_the_cup(run):
     names = run("visual_hull")
     hollow = names["filled"] & ~names["solid"]

@@ -17,7 +17,7 @@ from lsmgeo.cameras.camera_checks import check_views, views_per_scene
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
 from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, leading_shape
 from lsmgeo.errors import DTypeError, OptionError, ShapeError
-from lsmgeo.grids import DEPTHS, FrustumGrid, Lattice, VoxelGrid, check_depths, map_size
+from lsmgeo.grids import DEPTHS, FrustumGrid, Lattice, VoxelGrid, check_depths, check_pixel_depths, map_size
 from lsmgeo.kernels.request import Options, Sites
 
 __all__ = [
@@ -67,7 +67,7 @@ def _lattice(who: str, grid: Grid, source: Tensor) -> Lattice:
         return grid.lattice()
     lattice = grid.lattice(source.device)
     T, z = lattice.world_from_lattice, lattice.z
-    for scenes in (*T.shape[:-2], *z.shape[:-1][:1]):
+    for scenes in [tensor.shape[0] for tensor, shared in ((T, 2), (z, 1)) if tensor.dim() > shared]:
         if scenes != source.shape[0]:
             raise ShapeError(
                 f"{who}: grid must have one pose and one row of depths, or as many as scenes, B = {source.shape[0]}; "
@@ -99,6 +99,10 @@ def image_sites(
     _check_reference(who, reference, features, grid, options)
     T, x, y, z, projective = lattice
     T = T if T.dim() == 2 else T[:, None]  # (B, 1, 4, 4): shared by the views
+    if view_mask is not None and z.dim() == 5:  # depths of pixels that only masked views would read are not read
+        z = torch.where(view_mask.any(1)[:, None, None, None, None], z, 1.0)
+    if z.dim() == 5:
+        check_pixel_depths(who, z[:, 0])
     direction = direction_matrix(matrices, T, options.direction) if options.direction else None
     return Sites(multiply(matrices.projection(), T), direction, x, y, z, projective, view_mask)
 
@@ -219,5 +223,6 @@ def _frustum_sites(
     x, y = (torch.arange(n, dtype=torch.float64, device=source.device) for n in (size[1], size[0]))
     if view_mask is not None and depths.dim() > 2:  # those of masked views are not read
         depths = torch.where(view_mask.reshape(*views, *(1,) * (depths.dim() - 2)), depths, 1.0)
+    check_pixel_depths(who, depths)
     z = depths if depths.dim() == 5 else 1.0 / depths.double()
     return Sites(matrix, direction, x, y, z, True, view_mask)

@@ -201,11 +201,11 @@ def planes_of(depths: Tensor) -> int:
 def check_depths(who: str, depths: Tensor, axes: Sequence[int], view_mask: Tensor | None = None) -> None:
     """Require float32 or float64 depths with one of these numbers of axes, at least one plane.
 
-    Rows shared by all pixels must be positive, finite and strictly ascending, where values may be read. Depths of each
-    pixel are checked by the kernel that reads them.
+    Rows shared by all pixels must be positive, finite and strictly ascending, where values may be read. For depths of
+    each pixel see `check_pixel_depths`.
     """
     *others, last = (DEPTHS[number] for number in axes)
-    expected = f"{', '.join(others)} or {last}"
+    expected = f"{', '.join(others)} or {last}{', the same for all pixels,' if max(axes) < 4 else ''}"
     check_geometry(who, "depths", depths, expected)
     if depths.dim() not in axes or planes_of(depths) < 1:
         raise ShapeError(f"{who}: depths must be {expected} with P at least 1; got {tuple(depths.shape)}")
@@ -223,14 +223,36 @@ def check_depths(who: str, depths: Tensor, axes: Sequence[int], view_mask: Tenso
             )
 
 
+def check_pixel_depths(who: str, depths: Tensor) -> None:
+    """Require positive and finite depths, where values may be read; others of no pixel pass."""
+    if depths.dim() < 4 or not can_inspect(depths) or not depths.numel():
+        return
+    with torch.no_grad():
+        least, largest = depths.aminmax()  # NaN if there is one, and a tenth of the time of a comparison of each
+        if bool((least > 0) & (largest < torch.inf)):
+            return
+        index = tuple((~((depths > 0) & (depths < torch.inf))).nonzero()[0].tolist())
+        raise GridError(f"{who}: depths must be positive and finite; got {depths[index].item():.6g} at {list(index)}")
+
+
 def map_size(who: str, cameras: CameraTensors, depths: Tensor, size: tuple[int, int] | None) -> tuple[int, int]:
     """The (h, w) of maps: `size`, where depths are those of each pixel theirs, or the size of all cameras' images."""
     if depths.dim() < 4:
         return image_size(who, cameras, size)
+    check_map_size(who, depths, size)
     height, width = depths.shape[-2:]
-    if size is not None and check_size(who, "size", size, 2, "(h, w)") != (height, width):
-        raise ShapeError(f"{who}: size must be that of the depths of each pixel, {(height, width)}; got {size}")
     return height, width
+
+
+def check_map_size(who: str, depths: Tensor | None, size: tuple[int, int] | None) -> None:
+    """Require None or a size (h, w), that of depths of each pixel, if any."""
+    if size is None:
+        return
+    size = check_size(who, "size", size, 2, "(h, w)")  # type: ignore[assignment]
+    if depths is not None and depths.dim() > 3 and size != tuple(depths.shape[-2:]):
+        raise ShapeError(
+            f"{who}: size must be that of the depths of each pixel, {tuple(depths.shape[-2:])}; got {size}"
+        )
 
 
 def check_constant_depths(who: str, depths: Tensor, axes: Sequence[int] = (1, 2, 3)) -> None:
@@ -238,6 +260,7 @@ def check_constant_depths(who: str, depths: Tensor, axes: Sequence[int] = (1, 2,
     if isinstance(depths, torch.nn.Parameter):
         raise DTypeError(f"{who}: depths must be a plain tensor; got a Parameter (pass learned depths to the function)")
     check_depths(who, depths, axes)
+    check_pixel_depths(who, depths)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -330,6 +353,7 @@ class FrustumGrid:
 
     def centers(self) -> Tensor:
         """Site positions in the world, (P, h, w, 3) or (B, P, h, w, 3) as x, y, z, of the depths' dtype."""
+        check_pixel_depths("FrustumGrid", self.depths)
         return self.lattice().centers().to(self.depths.dtype)
 
 

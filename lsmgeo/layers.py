@@ -8,12 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from lsmgeo import kernels
-from lsmgeo._checks import check_size, describe, moved
+from lsmgeo._checks import describe, moved
 from lsmgeo._sites import Cameras, Grid
 from lsmgeo.errors import DTypeError, GridError
 from lsmgeo.functional.image_sampling import Names, Unprojected, run_unproject
 from lsmgeo.functional.volume_sampling import Projected, run_plane_sweep_project, run_splat
-from lsmgeo.grids import FrustumGrid, VoxelGrid, check_constant_depths
+from lsmgeo.grids import FrustumGrid, VoxelGrid, check_constant_depths, check_map_size
 
 __all__ = ["PlaneSweepProject", "Splat", "Unproject"]
 
@@ -181,7 +181,7 @@ class PlaneSweepProject(SweepingLayer):
         grid: the `VoxelGrid` on which the volumes live; None if it is passed to every call.
         depths: (P,), (B, P), (B, V, P) or, for each pixel, (B, V, P, h, w), see `lsmgeo.depth_planes`; None if passed
             to every call. Neither is part of the ``state_dict``; both follow the volume's device.
-        size: (h, w) of the maps; by default the cameras' image size.
+        size: (h, w) of the maps; by default the cameras' image size, or that of depths of each pixel.
         mode: "trilinear" or "nearest".
         padding_mode: "zeros" or "border".
         augment: "depth", "direction" or both.
@@ -196,7 +196,8 @@ class PlaneSweepProject(SweepingLayer):
         - maps: (B, V, C' P, h, w), or (B, V, C', P, h, w) where `flatten` is False; visible: (B, V, P, h, w) bool.
 
     Raises:
-        OptionError, DTypeError, GridError: at construction; for the rest see `lsmgeo.functional.plane_sweep_project`.
+        OptionError, DTypeError, ShapeError, GridError: at construction; for the rest see
+            `lsmgeo.functional.plane_sweep_project`.
 
     Example:
         >>> import torch
@@ -242,8 +243,7 @@ class PlaneSweepProject(SweepingLayer):
             memory_format=memory_format,
             backend=backend,
         )
-        if size is not None:
-            check_size(self.who, "size", size, 2, "(h, w)")
+        check_map_size(self.who, depths, size)
         self.size = size
 
     def forward(

@@ -1,7 +1,8 @@
 """Reductions of a swept volume along its rays, from planes to maps.
 
-A swept volume is (..., P, h, w) or (..., C, P, h, w) with the planes in ascending depth, as returned by
-``plane_sweep_project(..., flatten=False)``.
+A swept volume is (..., P, h, w) or (..., C, P, h, w), as returned by ``plane_sweep_project(..., flatten=False)``.
+`composite` needs the planes in ascending depth, and `project_reduce` planes that all pixels share; `expected_depth` and
+`max_along_rays` take depths of each pixel in any order.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ from lsmgeo._checks import (
     check_devices,
     check_flag,
     check_float,
-    check_size,
     check_whole,
     describe,
     moved,
@@ -29,7 +29,7 @@ from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
 from lsmgeo.functional import Projected
 from lsmgeo.functional.image_sampling import Names
-from lsmgeo.grids import VoxelGrid, check_constant_depths
+from lsmgeo.grids import VoxelGrid, check_constant_depths, check_map_size
 from lsmgeo.kernels.request import Options
 from lsmgeo.kernels.view_statistics import first_maximum
 from lsmgeo.layers import SamplingLayer
@@ -55,16 +55,25 @@ def _check_visible(who: str, visible: Tensor | None, planes: Tensor) -> None:
     check_devices(who, planes=planes, visible=visible)
 
 
-def _along_rays(who: str, depths: Tensor, planes: Tensor) -> Tensor:
-    """Depths (P,) or (..., P) as (..., P, 1, 1) against planes (..., P, h, w), in the computing dtype."""
-    check_float(who, "depths", depths, "(P,) or (..., P)")
-    if depths.dim() < 1 or depths.shape[-1] != planes.shape[-3]:
-        raise ShapeError(f"{who}: depths must be (..., P) with P = {planes.shape[-3]}; got {tuple(depths.shape)}")
+def _along_rays(who: str, depths: Tensor, planes: Tensor, ordered: bool = False) -> Tensor:
+    """Depths (..., P) or (..., P, h, w) as (..., P, 1 or h, 1 or w) against planes (..., P, h, w), to compute with."""
+    check_float(who, "depths", depths, "(P,), (..., P) or (..., P, h, w)")
+    shape = tuple(planes.shape[-3:])
+    per_pixel = depths.dim() == planes.dim() and tuple(depths.shape[-3:]) == shape
+    if not per_pixel and (depths.dim() < 1 or depths.shape[-1] != shape[0]):
+        raise ShapeError(
+            f"{who}: depths must be (..., P) with P = {shape[0]}, or of each pixel (..., P, h, w) with as many axes as "
+            f"the planes, {planes.dim()}, and (P, h, w) = {shape}; got {tuple(depths.shape)}"
+        )
     check_devices(who, planes=planes, depths=depths)
-    check_broadcast(who, depths=depths.shape[:-1], planes=planes.shape[:-3])
-    if can_inspect(depths) and not bool(depths.isfinite().all()):
-        raise GridError(f"{who}: depths must be finite; got a NaN or an infinity")
-    return depths.to(computing_dtype(planes))[..., None, None]
+    depths = depths if per_pixel else depths[..., None, None]
+    check_broadcast(who, depths=depths.shape[:-3], planes=planes.shape[:-3])
+    if can_inspect(depths):
+        if not bool(depths.isfinite().all()):
+            raise GridError(f"{who}: depths must be finite; got a NaN or an infinity")
+        if ordered and not bool((depths.diff(dim=-3) > 0).all()):
+            raise GridError(f"{who}: depths must ascend along each ray, from front to back; got others")
+    return depths.to(computing_dtype(planes))
 
 
 def expected_depth(scores: Tensor, depths: Tensor, visible: Tensor | None = None) -> Tensor:
@@ -75,14 +84,15 @@ def expected_depth(scores: Tensor, depths: Tensor, visible: Tensor | None = None
 
     Args:
         scores: (..., P, h, w); larger is more likely.
-        depths: (P,) or (..., P), world units.
+        depths: (P,) or (..., P), world units, or of each pixel (..., P, h, w) with as many axes as the scores; in any
+            order.
         visible: bool, broadcasts to the scores; samples where it is False have no weight.
 
     Returns:
         (..., h, w) depths; 0 on rays with no visible sample. Differentiable in scores and depths.
 
     Raises:
-        ShapeError, DTypeError, DeviceError: see `lsmgeo.errors`.
+        ShapeError, DTypeError, DeviceError, GridError: see `lsmgeo.errors`.
 
     Example:
         >>> import torch
@@ -154,7 +164,7 @@ def composite(alpha: Tensor, values: Tensor, depths: Tensor, visible: Tensor | N
     Args:
         alpha: (..., P, h, w) opacities in [0, 1].
         values: (..., C, P, h, w).
-        depths: (P,) or (..., P), world units.
+        depths: (P,) or (..., P), world units, or of each pixel (..., P, h, w) with as many axes as alpha; ascending.
         visible: bool, broadcasts to alpha; samples where it is False are transparent.
 
     Returns:
@@ -162,7 +172,7 @@ def composite(alpha: Tensor, values: Tensor, depths: Tensor, visible: Tensor | N
         for the mean), transmittance (..., h, w) and weights (..., P, h, w). Differentiable in all arguments.
 
     Raises:
-        ShapeError, DTypeError, DeviceError: see `lsmgeo.errors`.
+        ShapeError, DTypeError, DeviceError, GridError: see `lsmgeo.errors`; the last where depths do not ascend.
 
     Example:
         >>> import torch
@@ -183,7 +193,7 @@ def composite(alpha: Tensor, values: Tensor, depths: Tensor, visible: Tensor | N
         raise DTypeError(f"{who}: values must be of alpha's {alpha.dtype}; got {values.dtype}")
     check_devices(who, alpha=alpha, values=values)
     _check_visible(who, visible, alpha)
-    planes = _along_rays(who, depths, alpha)
+    planes = _along_rays(who, depths, alpha, ordered=True)
     output = alpha.dtype
     alpha, values = alpha.to(planes.dtype), values.to(planes.dtype)
     if visible is not None:
@@ -225,7 +235,7 @@ def project_reduce(
         volume: (B, C, D, H, W).
         cameras: B*V cameras, view fastest.
         grid: the volume's `VoxelGrid`.
-        depths: (P,), (B, P) or (B, V, P).
+        depths: (P,), (B, P) or (B, V, P), ascending; not those of each pixel, as a weight belongs to a plane.
         weight: (O, C' P), or (O, C' P, 1, 1) as ``torch.nn.Conv2d`` has it; input channel ``c * P + k``.
         bias: (O,) or None.
         size: (h, w) of the maps.
@@ -299,7 +309,7 @@ class ProjectReduce(SamplingLayer):
         in_channels: C of the volumes.
         out_channels: O.
         grid: the `VoxelGrid` on which the volumes live.
-        depths: (P,), (B, P) or (B, V, P).
+        depths: (P,), (B, P) or (B, V, P), ascending; not those of each pixel, as a weight belongs to a plane.
         size: (h, w) of the maps; by default the cameras' image size.
         bias: whether to add a learned bias.
         mode: as in `lsmgeo.PlaneSweepProject`, like all further options.
@@ -359,8 +369,7 @@ class ProjectReduce(SamplingLayer):
         if not isinstance(grid, VoxelGrid):
             raise DTypeError(f"{who}: grid must be a VoxelGrid; got {describe(grid)}")
         check_constant_depths(who, depths)
-        if size is not None:
-            check_size(who, "size", size, 2, "(h, w)")
+        check_map_size(who, depths, size)
         check_flag(who, "bias", bias)
         self.grid = grid
         self.depths = depths

@@ -34,8 +34,10 @@ def site_coordinates(sites: Sites, matrix: Tensor, dtype: torch.dtype) -> tuple[
 
 
 def site_depths(sites: Sites, dtype: torch.dtype) -> Tensor:
-    """The depths of sites that each have their own, (B, V, D, H, W)."""
-    return sites.z.to(dtype).expand(*sites.matrix.shape[:2], *sites.z.shape[2:])
+    """The depths of sites that each have their own, (B, V, D, H, W): what is positive and finite stays so."""
+    limits = torch.finfo(dtype if sites.z.dtype == torch.float64 else torch.float32)
+    depths = sites.z.clamp(limits.tiny, limits.max).to(dtype)
+    return depths.expand(*sites.matrix.shape[:2], *depths.shape[2:])
 
 
 def lattice_rows(matrix: Tensor, sites: Sites, dtype: torch.dtype) -> list[Tensor]:

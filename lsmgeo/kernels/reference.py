@@ -37,7 +37,7 @@ from lsmgeo.kernels.lattice_geometry import (
     site_depths,
 )
 from lsmgeo.kernels.recompute import recomputed
-from lsmgeo.kernels.request import Options, Sites, check_site_depths
+from lsmgeo.kernels.request import Options, Sites
 from lsmgeo.kernels.view_statistics import view_statistics
 
 __all__ = ["OPERATORS", "why_not"]
@@ -120,26 +120,6 @@ def _output(values: Tensor, depth: Tensor | None, direction: Tensor | None, dtyp
     return torch.cat(blocks, 2) if len(blocks) > 1 else blocks[0]
 
 
-def _sample_through_cameras(
-    source: Tensor, rows: Sequence[Tensor], unit: Tensor, view_mask: Tensor | None, options: Options
-) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
-    """Sample images (B, V, C, h, w) at homogeneous pixels, rows of (B, V, *sites).
-
-    Args:
-        source: the images.
-        rows: x, y and z of ``M q``.
-        unit: broadcasts to the rows: the z of a site at depth 1.
-        view_mask: (B, V) or None.
-        options: of the call.
-
-    Returns:
-        Values (B, V, C, *sites), visibility, depth or None, and which sites are in front.
-    """
-    index, front = perspective_division(rows, unit, view_mask, options)
-    values, visible = _sample(source, index, front, options)
-    return values, visible, mask_views(rows[2] / unit, view_mask) if options.depth else None, front
-
-
 def _correlate(values: Tensor, reference: Tensor, front: Tensor, groups: int) -> Tensor:
     """Means over groups of channels of reference times sample: (B, V, C, *sites) -> (B, V, groups, *sites).
 
@@ -196,7 +176,6 @@ def unproject(source: Tensor, sites: Sites, reference: Tensor | None, options: O
     Returns:
         (B, V, C', D, H, W), or (B, C'', D, H, W) where options.reduce is set, and visibility (B, V, D, H, W).
     """
-    check_site_depths("unproject", sites)
     dtype, output = computing_dtype(source), source.dtype
     source = source.to(dtype)
     scale = scale_below_overflow(lattice_extent(sites.matrix, sites))[..., None]  # (B, V, 1)
@@ -212,14 +191,13 @@ def unproject(source: Tensor, sites: Sites, reference: Tensor | None, options: O
     ) -> tuple[Tensor, Tensor]:
         matrix = matrix * scale[..., None]  # homogeneous: a factor moves no pixel
         part = sites.with_geometry(matrix, direction, sites.planes(z, start, stop))
-        rows = lattice_rows(matrix, part, dtype)
-        values, visible, depth, front = _sample_through_cameras(
-            source, rows, _unit(part, scale, dtype), part.view_mask, options
-        )
-        if depth is not None and part.per_site():  # again, without division by a number next to 0
-            m = part.matrix[..., 2:, :] / scale[..., None]
-            depth = plane_rows(m.to(dtype), part)[:, :, :, None] * site_depths(part, dtype)[:, :, None]
-            depth = mask_views(depth[:, :, 0] + m[..., 2, None, None].to(dtype), part.view_mask)
+        rows, unit = lattice_rows(matrix, part, dtype), _unit(part, scale, dtype)
+        index, front = perspective_division(rows, unit, part.view_mask, options)
+        values, visible = _sample(source, index, front, options)
+        depth = None
+        if options.depth:
+            depth = _own_depths(part, scale, dtype) if part.per_site() else rows[2] / unit
+            depth = mask_views(depth, part.view_mask)
         if reference is not None:
             at_planes = reference if reference.shape[2] == 1 else reference[:, :, start:stop]
             values = _correlate(values, at_planes.to(dtype), front, options.groups)
@@ -235,6 +213,13 @@ def _unit(sites: Sites, scale: Tensor, dtype: torch.dtype) -> Tensor:
     if sites.per_site():
         return site_coordinates(sites, sites.matrix, dtype)[1] * scale.to(dtype)[..., None, None]
     return (per_view(sites.z, sites.matrix) * scale if sites.projective else scale).to(dtype)[..., None, None]
+
+
+def _own_depths(sites: Sites, scale: Tensor, dtype: torch.dtype) -> Tensor:
+    """The views' depths of sites that each have their own: no division by a number next to 0. M is times `scale`."""
+    m = (sites.matrix[..., 2:, :] / scale[..., None]).to(dtype)  # (B, V, 1, 4)
+    plane = plane_rows(m, sites)[:, :, :, None] * site_depths(sites, dtype)[:, :, None]
+    return plane[:, :, 0] + m[..., 2, None, None]
 
 
 def unproject_points(
@@ -255,8 +240,10 @@ def unproject_points(
     def piece(
         start: int, stop: int, source: Tensor, matrix: Tensor, direction: Tensor | None, points: Tensor
     ) -> tuple[Tensor, Tensor]:
-        rows = point_rows(matrix * scale[..., None], points[:, start:stop], dtype)
-        values, visible, depth, _ = _sample_through_cameras(source, rows, scale.to(dtype), view_mask, options)
+        rows, unit = point_rows(matrix * scale[..., None], points[:, start:stop], dtype), scale.to(dtype)
+        index, front = perspective_division(rows, unit, view_mask, options)
+        values, visible = _sample(source, index, front, options)
+        depth = mask_views(rows[2] / unit, view_mask) if options.depth else None
         vectors = None
         if direction is not None:
             vectors = point_directions(direction, points, slice(start, stop), view_mask, dtype)
@@ -346,7 +333,6 @@ def plane_sweep_project(source: Tensor, sites: Sites, options: Options) -> tuple
     Returns:
         (B, V, C', P, h, w) and visibility (B, V, P, h, w).
     """
-    check_site_depths("plane_sweep_project", sites)
     return _sweep(source.to(computing_dtype(source)), sites, options, source.dtype)
 
 
@@ -405,7 +391,6 @@ def splat(features: Tensor, sites: Sites, weights: Tensor | None, shape: Sequenc
     Returns:
         (B, C, D, H, W), float64 for float64, else float32.
     """
-    check_site_depths("splat", sites)
     dtype = computing_dtype(features)
     index, front, _ = _sweep_index(sites, options, dtype)
     values = features.to(dtype)

@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from lsmgeo._checks import check_choice, check_choices, check_flag, check_number, check_whole, describe
-from lsmgeo.debugging import can_inspect
-from lsmgeo.errors import GridError, OptionError
+from lsmgeo.errors import OptionError
 
-__all__ = ["OPERATORS", "Options", "Sites", "check_site_depths", "invalid_depth"]
+__all__ = ["OPERATORS", "Options", "Sites"]
 
 OPERATORS = ("unproject", "unproject_points", "sample_views", "plane_sweep_project", "project_reduce", "splat")
 PADDING_MODES = ("zeros", "border")
@@ -120,22 +119,3 @@ class Options(NamedTuple):
             raise OptionError(f"{who}: memory_format must be None or torch.contiguous_format; got {memory_format!r}")
         direction, contiguous = frame if "direction" in extra else "", memory_format is not None
         return cls(mode, padding_mode, "depth" in extra, direction, statistics, distance, flatten, groups, contiguous)
-
-
-def invalid_depth(operator: str, value: float) -> GridError:
-    """The error for a depth of a site that is not positive and finite."""
-    who = {"unproject": "Unproject", "plane_sweep_project": "PlaneSweepProject", "splat": "Splat"}[operator]
-    return GridError(f"{who}: depths must be positive and finite; got {value:.6g}")
-
-
-def check_site_depths(operator: str, sites: Sites) -> None:
-    """Raise `invalid_depth` for the first bad depth of a view that is not masked, where values may be read."""
-    if not sites.per_site() or not can_inspect(sites.z):
-        return
-    with torch.no_grad():
-        good = (sites.z > 0) & sites.z.isfinite()
-        if sites.view_mask is not None:
-            mask = sites.view_mask if sites.z.shape[1] > 1 else sites.view_mask.any(1, keepdim=True)
-            good = good | ~mask[:, :, None, None, None]
-        if not bool(good.all()):
-            raise invalid_depth(operator, sites.z[~good][0].item())

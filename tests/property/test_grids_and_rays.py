@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,7 @@ from hypothesis import strategies as st
 from lsmgeo import PlaneSweepProject, Unproject, VoxelGrid, depth_planes, functional, rays
 from lsmgeo.cameras import crop, look_at, orbit, perturb
 from lsmgeo.cameras import rays as camera_rays
-from lsmgeo.errors import GridError
+from lsmgeo.errors import GridError, ShapeError
 from tests import oracle, tolerances
 from tests.property import support
 from tests.strategies import scenes, vectors
@@ -198,6 +200,29 @@ def test_along_ray_reductions_are_their_definitions(seed, with_visible):
         support.assert_within(support.array(blended.values[b, :, j, i]), color, 1e-12)
         support.assert_within(support.array(blended.depth[b, j, i]), np.array(depth), 1e-12)
         support.assert_within(support.array(blended.transmittance[b, j, i]), np.array(light), 1e-12)
+
+
+def test_rays_may_have_depths_of_their_own():
+    values, visible = (torch.from_numpy(array) for array in swept(3))
+    scores, alpha = values[:, 0], values[:, 1].sigmoid()
+    depths = 1.0 + torch.rand(2, 5, 4, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(4)).cumsum(1)
+    found, blended = rays.expected_depth(scores, depths, visible), rays.composite(alpha, values, depths, visible)
+    for j, i in np.ndindex(4, 6):
+        at = (..., slice(j, j + 1), slice(i, i + 1))
+        own = depths[..., j, i]  # (B, P)
+        support.assert_within(
+            support.array(found[at]), rays.expected_depth(scores[at], own, visible[at]).numpy(), 1e-12
+        )
+        expected = rays.composite(alpha[at], values[at], own, visible[at])
+        support.assert_within(support.array(blended.depth[at]), expected.depth.numpy(), 1e-12)
+    order = torch.tensor([3, 0, 4, 1, 2])
+    moved = rays.expected_depth(scores[:, order], depths[:, order], visible[:, order])
+    support.assert_within(support.array(moved), found.numpy(), 1e-12)
+    for shuffled in (depths[:, order], depths[0, order, 0, 0]):
+        with pytest.raises(GridError, match="composite: depths must ascend along each ray, from front to back"):
+            rays.composite(alpha, values, shuffled, visible)
+    with pytest.raises(ShapeError, match=re.escape("(P, h, w) = (5, 4, 6); got (5, 4, 6)")):
+        rays.expected_depth(scores, depths[0])
 
 
 @support.FEWER

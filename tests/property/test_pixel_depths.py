@@ -173,20 +173,67 @@ def test_extreme_depths_give_finite_answers(scale, backend):
         assert bool(depths.grad.isfinite().all())
 
 
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_depths_of_a_masked_scene_are_not_read(backend):
+    depths = cases.PIXEL_DEPTHS[:, 0].clone()
+    depths[1] = torch.nan
+    depths.requires_grad_()
+    mask = torch.tensor([[True, False, True], [False] * 3])
+    grid = FrustumGrid(cases.CAMERA, depths)
+    volume, visible = functional.unproject(
+        cases.FEATURES, cases.VIEWS, grid, view_mask=mask, augment=("depth", "direction"), backend=backend
+    )
+    assert bool(visible[0].any())
+    (gradient,) = torch.autograd.grad(volume.square().sum(), depths)
+    assert float(gradient[0].abs().max()) > 0.1
+    assert not bool(gradient[1].any())  # nor NaN
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-42, 1e50])
+def test_depths_beyond_float32_saturate(scale):
+    near = 0.5 * float(torch.finfo(torch.float32).tiny)
+    own = torch.full(cases.PIXEL_DEPTHS.shape, scale, dtype=torch.float64)
+    answers = []
+    for backend in ("auto", "reference"):
+        depths, shared = own.clone().requires_grad_(), own[:, 0].clone().requires_grad_()
+        maps, seen = functional.plane_sweep_project(
+            cases.VOLUME, cases.VIEWS, cases.GRID, depths, near=near, augment="depth", flatten=False, backend=backend
+        )
+        volume, visible = functional.unproject(
+            cases.FEATURES, cases.VIEWS, FrustumGrid(cases.CAMERA, shared), augment="depth", backend=backend
+        )
+        answers.append((maps, seen, volume, visible))
+        gradients = torch.autograd.grad(maps.sum() + volume[:, :, : cases.C].sum(), (depths, shared))
+        for tensor in (maps, volume, *gradients):
+            assert bool(tensor.isfinite().all())
+    assert bool((answers[0][0][:, :, -1] > 0).all())
+    support.assert_same(answers[0][1], answers[1][1])
+    torch.testing.assert_close(answers[0], answers[1], rtol=1e-5, atol=1e-5)
+
+
 @pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])
 @pytest.mark.parametrize("backend", ["auto", "reference"])
 def test_bad_depths_are_named(value, backend):
     depths = cases.PIXEL_DEPTHS.clone()
-    depths[1, 2, 3, 4, 5] = value
-    message = re.escape(f"depths must be positive and finite; got {value:.6g}")
-    with pytest.raises(GridError, match=f"Unproject: {message}"):
-        Unproject(FrustumGrid(cases.CAMERA, depths[:, 2]), backend=backend)(cases.FEATURES, cases.VIEWS)
-    project = PlaneSweepProject(cases.GRID, depths, backend=backend)
-    with pytest.raises(GridError, match=f"PlaneSweepProject: {message}"):
-        project(cases.VOLUME, cases.VIEWS)
+    depths[1, 2, 3, 4, 4] = value
+    depths[1, 2, 3, 4, 5:] = -2.0  # later: the first is named
+    message = re.escape(f"depths must be positive and finite; got {value:.6g} at [1, 3, 4, 4]") + "$"
+    grid = FrustumGrid(cases.CAMERA, depths[:, 2])
+    with pytest.raises(GridError, match=f"^Unproject: {message}"):
+        Unproject(grid, backend=backend)(cases.FEATURES, cases.VIEWS)
+    with pytest.raises(GridError, match=f"^unproject_slabs: {message}"):  # at the call
+        functional.unproject_slabs(cases.FEATURES, cases.VIEWS, grid, 3, backend=backend)
+    with pytest.raises(GridError, match=f"^FrustumGrid: {message}"):
+        grid.centers()
+    message = message.replace("1,", "1,\\ 2,", 1)
+    with pytest.raises(GridError, match=f"^PlaneSweepProject: {message}"):
+        PlaneSweepProject(cases.GRID, depths, backend=backend)
+    project = PlaneSweepProject(cases.GRID, backend=backend)
+    with pytest.raises(GridError, match=f"^PlaneSweepProject: {message}"):
+        project(cases.VOLUME, cases.VIEWS, depths=depths)
     mask = torch.ones(2, 3, dtype=torch.bool)
     mask[1, 2] = False
-    maps, visible = project(cases.VOLUME, cases.VIEWS, mask)  # of a masked view they are not read
+    maps, visible = project(cases.VOLUME, cases.VIEWS, mask, depths=depths)  # of a masked view they are not read
     assert bool(maps.isfinite().all())
     assert bool(visible.any())
 
@@ -197,6 +244,8 @@ def test_shapes_are_checked():
         ShapeError, match=re.escape("size must be that of the depths of each pixel, (5, 6); got (5, 7)")
     ):
         FrustumGrid(cases.CAMERA, depths[:, 0], (5, 7))
+    with pytest.raises(ShapeError, match=re.escape("PlaneSweepProject: size must be that of the depths of each pixel")):
+        PlaneSweepProject(cases.GRID, depths, (5, 7))
     with pytest.raises(ShapeError, match=re.escape("depths must be (B, P, h, w) with B = 2 cameras; got (1, 4, 5, 6)")):
         FrustumGrid(cases.CAMERA, depths[:1, 0])
     with pytest.raises(ShapeError, match=re.escape("depths must be (P,), (B, P) or (B, P, h, w) with P at least 1")):
@@ -205,7 +254,9 @@ def test_shapes_are_checked():
         functional.plane_sweep_project(cases.VOLUME, cases.VIEWS, cases.GRID, depths[:, :2])
     with pytest.raises(ShapeError, match=re.escape("depths must be (P,), (B, P), (B, V, P) or (B, V, P, h, w)")):
         functional.plane_sweep_project(cases.VOLUME, cases.VIEWS, cases.GRID, depths[:, 0])
-    with pytest.raises(ShapeError, match=re.escape("depths must be (P,), (B, P) or (B, V, P) with P at least 1")):
+    with pytest.raises(
+        ShapeError, match=re.escape("(P,), (B, P) or (B, V, P), the same for all pixels, with P at least")
+    ):
         lsmgeo.rays.project_reduce(cases.VOLUME, cases.VIEWS, cases.GRID, depths, cases.WEIGHT)
 
 

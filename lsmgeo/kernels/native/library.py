@@ -15,7 +15,7 @@ from torch import Tensor
 from lsmgeo._dtypes import saturating_cast
 from lsmgeo.kernels.lattice_geometry import per_view
 from lsmgeo.kernels.native.loading import Call, empty, missing, run
-from lsmgeo.kernels.request import Options, Sites, invalid_depth
+from lsmgeo.kernels.request import Options, Sites
 
 UNPROJECT, SAMPLE_VIEWS, PLANE_SWEEP_PROJECT = range(3)
 TYPES = {torch.float32: 0, torch.bfloat16: 1, torch.float16: 2, torch.float64: 3}
@@ -219,10 +219,6 @@ def _forward(
     call.values_stride[:] = _value_strides(out, options)
     run(call, backward=False)
     del alive
-    if call.has_invalid_depth:
-        raise invalid_depth(
-            "plane_sweep_project" if call.kind == PLANE_SWEEP_PROJECT else "unproject", call.invalid_depth
-        )
     return out, visible
 
 

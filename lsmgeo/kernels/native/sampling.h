@@ -23,7 +23,7 @@ inline double plane_z(const Call &call, const Tile &tile, int64_t k) {
     return call.z[tile.scene * call.z_stride[0] + tile.view * call.z_stride[1] + k * call.z_stride[2]];
 }
 
-// The depths of the sites, where each has its own; the first that is not positive and finite is reported. Of homogeneous
+// The depths of the sites, where each has its own; one that is not positive and finite counts as 1. Of homogeneous
 // q = (x, y, 1 / depth, 1) the multiple with w = min(depth, 1) is taken: nothing overflows, whatever the depth is.
 inline void load_depths(const Plan &plan, Tile &tile) {
     const Call &call = *plan.call;

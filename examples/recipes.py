@@ -19,12 +19,13 @@ def mvsnet_variance(features: Tensor, cameras: CameraTensors, depths: Tensor) ->
 
 def casmvsnet_stage(
     features: Tensor, cameras: CameraTensors, depth: Tensor, interval: float, planes: int
-) -> tuple[Tensor, Tensor]:
-    """A CasMVSNet stage: hypotheses (B, P, h, w) around a coarse depth map (B, h, w), and their variance."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """A CasMVSNet stage: hypotheses (B, P, h, w) around a depth map (B, h, w), their variance, and where it counts."""
     offsets = interval * (torch.arange(planes, dtype=depth.dtype, device=depth.device) - planes // 2)
     hypotheses = (depth[:, None] + offsets[:, None, None]).clamp_min(1e-3)
-    volume, _ = Unproject(FrustumGrid(cameras.at((slice(None), 0)), hypotheses), reduce="variance")(features, cameras)
-    return hypotheses, volume
+    frustum = FrustumGrid(cameras.at((slice(None), 0)), hypotheses)
+    volume, visible = Unproject(frustum, reduce="variance")(features, cameras)
+    return hypotheses, volume, visible.sum(1) >= 2
 
 
 def patchmatchnet_step(
@@ -34,7 +35,8 @@ def patchmatchnet_step(
 
     `weights` (B, V - 1, h, w) say how much each source view counts.
     """
-    hypotheses = torch.stack([depth.roll(shift, axis) for shift, axis in ((0, 1), (1, 1), (-1, 1), (1, 2), (-1, 2))], 1)
+    near = torch.nn.functional.pad(depth[:, None], (1, 1, 1, 1), mode="replicate").unfold(2, 3, 1).unfold(3, 3, 1)
+    hypotheses = near[:, 0].flatten(3)[..., [4, 1, 7, 3, 5]].movedim(-1, 1)  # itself, above, below, left, right
     frustum, sources = FrustumGrid(cameras.at((slice(None), 0)), hypotheses), cameras.at((slice(None), slice(1, None)))
     match, visible = Unproject(frustum, groups=groups)(features[:, 1:], sources, reference=features[:, 0, :, None])
     share = weights[:, :, None] * visible
@@ -57,6 +59,6 @@ def simplerecon_volume(features: Tensor, cameras: CameraTensors, depths: Tensor)
     unproject = Unproject(frustum, augment=("depth", "direction"))
     values, visible = unproject(features[:, 1:], sources, reference=features[:, 0, :, None])
     ray = unproject(features[:, :1, :0], own).volume[:, :, 1:]  # the reference's own direction
-    angle = (ray * values[:, :, 2:]).sum(2, keepdim=True).clamp(-1, 1).acos()
+    angle = (ray * values[:, :, 2:]).sum(2, keepdim=True).clamp(-1 + 1e-6, 1 - 1e-6).acos()
     baseline = (centers(sources) - centers(own)).norm(dim=-1)[:, :, None, None, None, None]
     return torch.cat((values, angle, visible[:, :, None], baseline.expand_as(angle)), 2)

@@ -384,8 +384,13 @@ def to_pytorch3d(cameras: Cameras, *, in_ndc: bool = True) -> PyTorch3DCameras:
     check_flag(who, "in_ndc", in_ndc)
     tensors = as_tensors(cameras, who)
     K, R, t = _split(who, tensors, "half")
-    if can_inspect(K) and not bool(is_unskewed(K).all()):
-        raise CameraError(f"{who}: cameras must have no skew and no rolled image, which PyTorch3D cannot hold")
+    if can_inspect(K) and not bool((good := is_unskewed(K)).all()):
+        index = tuple((~good).nonzero()[0].tolist())
+        skew, roll = (float(f"{K[index][place].item():.6g}") for place in ((0, 1), (1, 0)))
+        raise CameraError(
+            f"{who}: cameras{list(index) if index else ''}: must have no skew and no rolled image, which PyTorch3D "
+            f"cannot hold (see cameras.warp); K[0, 1] and K[1, 0] are {skew} and {roll}"
+        )
     focal_length = K.diagonal(dim1=-2, dim2=-1)[..., :2]
     principal_point = K[..., :2, 2]
     if in_ndc:

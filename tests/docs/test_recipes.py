@@ -87,11 +87,13 @@ def test_mvsnet_variance():
 
 def test_casmvsnet_stage():
     coarse = 1.4 + 0.3 * torch.rand(B, *SIZE, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    hypotheses, volume = recipes.casmvsnet_stage(FEATURES, CAMERAS, coarse, 0.1, 4)
+    hypotheses, volume, known = recipes.casmvsnet_stage(FEATURES, CAMERAS, coarse, 0.1, 4)
     expected = coarse.numpy()[:, None] + 0.1 * np.array([-2.0, -1.0, 0.0, 1.0])[:, None, None]
     close(hypotheses, expected)
     values, visible = warped(expected)
     close(volume, variance(values[:, :, :C], visible))
+    np.testing.assert_array_equal(known.numpy(), visible.sum(1) >= 2)
+    assert 0 < known.float().mean() < 1
 
 
 def test_patchmatchnet_step():
@@ -102,6 +104,8 @@ def test_patchmatchnet_step():
     assert hypotheses.shape == (B, 5, *SIZE)
     assert bool((hypotheses.diff(dim=1) < 0).any())  # in no order
     np.testing.assert_array_equal(hypotheses[:, 1, 1:].numpy(), depth[:, :-1].numpy())
+    np.testing.assert_array_equal(hypotheses[:, 4, :, :-1].numpy(), depth[..., 1:].numpy())
+    np.testing.assert_array_equal(hypotheses[:, 4, :, -1].numpy(), depth[..., -1].numpy())  # at the border its own
     values, visible = warped(hypotheses.numpy())
     share = weights.numpy()[:, :, None] * visible[:, 1:]
     share = share / np.maximum(share.sum(1, keepdims=True), 1e-6)
@@ -126,11 +130,20 @@ def test_simplerecon_volume():
         correlation(values[:, :, :C], 1)[:, :, 0],
         values[:, 1:, C],
         *np.moveaxis(values[:, 1:, C + 1 :], 2, 0),
-        np.arccos(np.clip(cosine, -1, 1)),
+        np.arccos(np.clip(cosine, -1 + 1e-6, 1 - 1e-6)),
         visible[:, 1:],
         np.broadcast_to(np.linalg.norm(centers[:, 1:] - centers[:, :1], axis=-1)[:, :, None, None, None], cosine.shape),
     ]
     np.testing.assert_allclose(volume, np.stack(expected, 2), atol=1e-6)
+
+
+def test_the_angle_between_equal_rays_has_a_finite_gradient():
+    same = CAMERAS.at((slice(None), [0, 0])).to(torch.float32)
+    moved = same.cam_from_world.clone().requires_grad_()
+    volume = recipes.simplerecon_volume(FEATURES[:, :2].float(), same._replace(cam_from_world=moved), DEPTHS)
+    assert float(volume.detach()[:, :, 5].min()) > 1e-3  # at 0 its derivative is infinite
+    (gradient,) = torch.autograd.grad(volume[:, :, :6].sum(), moved)
+    assert bool(gradient.isfinite().all())
 
 
 def test_recipes_are_short_and_shown():

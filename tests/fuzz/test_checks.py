@@ -115,7 +115,7 @@ MISTAKES = {
         "from_colmap: quaternion must not be zero": lambda: cameras.from_colmap(
             torch.eye(3), torch.zeros(4), torch.zeros(3), 4, 4
         ),
-        "to_pytorch3d: cameras must have no skew": lambda: cameras.to_pytorch3d(
+        "to_pytorch3d: cameras[0, 0]: must have no skew": lambda: cameras.to_pytorch3d(
             with_value("intrinsics", (0, 0, 0, 1), 0.5)
         ),
     },

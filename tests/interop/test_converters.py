@@ -162,8 +162,11 @@ class TestPyTorch3D:
         torch.testing.assert_close(camera.intrinsics.diagonal(), torch.tensor([18.0, 18.0, 1.0]))
 
     def test_skew_has_no_place_there(self):
-        with pytest.raises(CameraError, match="no skew"):
-            cameras.to_pytorch3d(skewed())
+        given = skewed()
+        given.intrinsics[..., 0, 1] = given.intrinsics[..., 1, 0] = 0.0
+        given.intrinsics[1, 0, 0, 1] = 0.5
+        with pytest.raises(CameraError, match=r"cameras\[1, 0\]: .* no skew .* are 0.5 and 0.0$"):
+            cameras.to_pytorch3d(given)
 
 
 def assert_cameras(actual: CameraTensors, expected: CameraTensors) -> None:

@@ -4,7 +4,7 @@ How do cameras on a car see the street from above?
 
 Six cameras look around from the roof of a car. A map of the street from above needs to know where along its ray each
 pixel belongs. Lifting does not know: every voxel takes what the cameras see there, so a car colours its whole ray.
-Splatting puts each pixel where its depth is likely :cite:p:`philion2020lift`.
+Splatting puts each pixel where its depth is likely.
 """
 
 # %%
@@ -39,8 +39,8 @@ voxels_seen = visible[0].any(0).sum(0)  # of the eight at each place
 lifted = torch.where(voxels_seen > 0, volume[0].sum(1) / voxels_seen, torch.nan)  # (4, rows, columns)
 
 # %%
-# Splatting: each pixel is added to the cells along its ray with the probability of each depth, here a normal
-# distribution about the true depth. The ones appended to the features count what a cell received.
+# Splatting :cite:p:`philion2020lift`: each pixel is added to the cells along its ray with the probability of each
+# depth, here a normal distribution about the true depth. The ones appended to the features count what a cell received.
 
 depths = depth_planes(1.0, 25.0, 97)
 splat = Splat(VoxelGrid((1, rows, columns), (*lower, -1.0), (*upper, 4.0)), depths)

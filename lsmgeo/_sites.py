@@ -11,12 +11,13 @@ from math import prod
 import torch
 from torch import Tensor
 
-from lsmgeo._checks import check_devices, check_float, describe
+from lsmgeo._checks import check_devices, check_float, check_geometry, describe, moved
 from lsmgeo._linalg import affine_inverse, multiply
 from lsmgeo.cameras.camera_checks import check_views, views_per_scene
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
 from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, leading_shape
-from lsmgeo.errors import DTypeError, OptionError, ShapeError
+from lsmgeo.debugging import can_inspect
+from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
 from lsmgeo.grids import DEPTHS, FrustumGrid, Lattice, VoxelGrid, check_depths, check_pixel_depths, map_size
 from lsmgeo.kernels.request import Options, Sites
 
@@ -24,11 +25,13 @@ __all__ = [
     "Cameras",
     "Grid",
     "check_features",
+    "check_points",
     "direction_matrix",
     "image_matrices",
     "image_sites",
     "splat_sites",
     "sweep_sites",
+    "volume_from_points",
 ]
 
 Grid = VoxelGrid | FrustumGrid
@@ -50,6 +53,16 @@ def check_features(
         axes = ", ".join(expected.strip("()").split(", ")[3:-1])
         raise ShapeError(f"{who}: features must be {expected}, V, {axes} and w at least 1; got {tuple(features.shape)}")
     return B, V
+
+
+def check_points(who: str, name: str, source: Tensor, points: Tensor) -> None:
+    """Require points (B, N, 3), finite where values may be read, B and the device those of `source`, called `name`."""
+    check_geometry(who, "points", points, "(B, N, 3)", rank=3)
+    if points.shape[0] != source.shape[0] or points.shape[2] != 3:
+        raise ShapeError(f"{who}: points must be (B, N, 3) with B = {source.shape[0]}; got {tuple(points.shape)}")
+    check_devices(who, **{name: source}, points=points)
+    if can_inspect(points) and not bool(points.isfinite().all()):
+        raise GridError(f"{who}: points must be finite")
 
 
 def image_matrices(who: str, features: Tensor, cameras: Cameras, view_mask: Tensor | None) -> CameraMatrices:
@@ -143,10 +156,7 @@ def sweep_sites(
     """The checked sites of the views' frustums in a volume; depths may be those of each pixel if `per_pixel`."""
     check_float(who, "volume", volume, "(B, C, D, H, W)", rank=5)
     _check_voxel_grid(who, grid)
-    if tuple(volume.shape[2:]) != grid.shape:
-        raise ShapeError(
-            f"{who}: volume must be (B, C, D, H, W) with the grid's (D, H, W) = {grid.shape}; got {tuple(volume.shape)}"
-        )
+    _check_on_grid(who, volume, grid)
     tensors = as_tensors(cameras, who)
     views = views_per_scene(who, tensors, volume.shape[0], "volume's")
     axes = (1, 2, 3, 5) if per_pixel else (1, 2, 3)
@@ -185,6 +195,37 @@ def splat_sites(
             f"{who}: features must be (B, V, C, P, h, w) with the depths' P = {planes[2]}; got {tuple(features.shape)}"
         )
     return sites
+
+
+def volume_from_points(who: str, volume: Tensor, grid: Grid, points: Tensor) -> tuple[Tensor, Tensor | None]:
+    """A matrix (B, 1, 3, 4) that maps checked points (X, 1) to a volume on a grid, and depths.
+
+    To the index on a `VoxelGrid`, with no depths; to the homogeneous pixel, whose third coordinate is the depth, on a
+    `FrustumGrid`, with the depths of its planes, (P,) or (B, P) in float64.
+    """
+    check_float(who, "volume", volume, "(B, C, D, H, W)", rank=5)
+    lattice = _lattice(who, grid, volume)
+    _check_on_grid(who, volume, grid)
+    check_points(who, "volume", volume, points)
+    depths = None
+    if isinstance(grid, VoxelGrid):
+        rows = affine_inverse(lattice.world_from_lattice)[..., :3, :]
+    else:
+        if grid.depths.dim() == 4:
+            raise ShapeError(
+                f"{who}: grid must have depths (P,) or (B, P), not of each pixel; got {tuple(grid.depths.shape)}"
+            )
+        inverse = moved(who, "grid", grid.lattice_from_world, volume.device)
+        rows = torch.cat((inverse[..., :2, :], inverse[..., 3:, :]), -2)
+        depths = moved(who, "grid", grid.depths, volume.device).double()
+    return rows.expand(volume.shape[0], 3, 4)[:, None], depths
+
+
+def _check_on_grid(who: str, volume: Tensor, grid: Grid) -> None:
+    if tuple(volume.shape[2:]) != grid.shape:
+        raise ShapeError(
+            f"{who}: volume must be (B, C, D, H, W) with the grid's (D, H, W) = {grid.shape}; got {tuple(volume.shape)}"
+        )
 
 
 def _check_voxel_grid(who: str, grid: VoxelGrid) -> None:

@@ -13,13 +13,15 @@ from lsmgeo.functional.image_sampling import (
     unproject_slabs,
     view_statistics,
 )
-from lsmgeo.functional.volume_sampling import Projected, plane_sweep_project, splat
+from lsmgeo.functional.volume_sampling import Projected, Sampled, plane_sweep_project, sample_volume, splat
 
 __all__ = [
     "Projected",
+    "Sampled",
     "Unprojected",
     "plane_sweep_project",
     "sample_views",
+    "sample_volume",
     "splat",
     "unproject",
     "unproject_points",

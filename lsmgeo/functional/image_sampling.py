@@ -11,7 +11,7 @@ from torch import Tensor
 from lsmgeo import kernels
 from lsmgeo._checks import check_choices, check_devices, check_float, check_geometry, check_mask, check_whole
 from lsmgeo._dtypes import computing_dtype, saturating_cast
-from lsmgeo._sites import Cameras, Grid, check_features, direction_matrix, image_matrices, image_sites
+from lsmgeo._sites import Cameras, Grid, check_features, check_points, direction_matrix, image_matrices, image_sites
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import GridError, OptionError, ShapeError
 from lsmgeo.kernels.request import STATISTICS, Options
@@ -237,12 +237,7 @@ def unproject_points(
         who, "bilinear", backend, mode, padding_mode, augment, direction_frame, reduce, near
     )
     matrices = image_matrices(who, features, cameras, view_mask)
-    check_geometry(who, "points", points, "(B, N, 3)", rank=3)
-    if points.shape[0] != features.shape[0] or points.shape[2] != 3:
-        raise ShapeError(f"{who}: points must be (B, N, 3) with B = {features.shape[0]}; got {tuple(points.shape)}")
-    check_devices(who, features=features, points=points)
-    if can_inspect(points) and not bool(points.isfinite().all()):
-        raise GridError(f"{who}: points must be finite")
+    check_points(who, "features", features, points)
     direction = None
     if options.direction:
         world = torch.eye(4, dtype=torch.float64, device=features.device)

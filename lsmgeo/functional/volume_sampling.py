@@ -8,19 +8,36 @@ import torch
 from torch import Tensor
 
 from lsmgeo import kernels
-from lsmgeo._dtypes import saturating_cast
-from lsmgeo._sites import Cameras, splat_sites, sweep_sites
+from lsmgeo._dtypes import computing_dtype, saturating_cast
+from lsmgeo._sites import Cameras, Grid, splat_sites, sweep_sites, volume_from_points
 from lsmgeo.functional.image_sampling import Names
 from lsmgeo.grids import VoxelGrid
+from lsmgeo.kernels.lattice_geometry import volume_index
+from lsmgeo.kernels.reference import sample_cells
 from lsmgeo.kernels.request import Options
 
-__all__ = ["Projected", "plane_sweep_project", "run_plane_sweep_project", "run_splat", "splat"]
+__all__ = [
+    "Projected",
+    "Sampled",
+    "plane_sweep_project",
+    "run_plane_sweep_project",
+    "run_splat",
+    "sample_volume",
+    "splat",
+]
 
 
 class Projected(NamedTuple):
     """Swept volumes, and which sample lies in the volume."""
 
     maps: Tensor
+    visible: Tensor
+
+
+class Sampled(NamedTuple):
+    """Values of a volume at points, and which points lie in it."""
+
+    values: Tensor
     visible: Tensor
 
 
@@ -181,3 +198,58 @@ def run_splat(
     sites = splat_sites("Splat", features, weights, cameras, grid, depths, view_mask, options)
     volume = kernels.run("splat", features, sites, weights, grid.shape, options=options)
     return saturating_cast(volume, features.dtype)
+
+
+def sample_volume(
+    volume: Tensor,
+    grid: Grid,
+    points: Tensor,
+    *,
+    mode: str = "trilinear",
+    padding_mode: str = "zeros",
+    near: float = 1e-6,
+) -> Sampled:
+    """Read a volume at points of the world: samples along rays, surface points, a layered image from another view.
+
+    Equation: ``f(X) = G(i)`` with G the volume interpolated and i the index of X: on a `VoxelGrid` ``i = A^-1 X``, A
+    its world from index; on a `FrustumGrid` the pixel ``(x / z, y / z)`` and the plane of depth z, ``(x, y, z) =
+    K (R X + t)``. Between planes k and k + 1 at depths a and b, the plane is ``k + (1/a - 1/z) / (1/a - 1/b)``, linear
+    in 1/z as a homography's pixels are; before the first plane and behind the last, the end intervals go on.
+
+    Convention:
+        Voxel centres, pixel centres and planes at integers. A point is visible where its index lies in
+        [-0.5, n - 0.5) on each axis, and on a frustum beyond `near`; at or behind `near` the values are exactly 0,
+        whatever `padding_mode`. A frustum of one plane has the same values at all depths: its index along z is 0.
+
+    Args:
+        volume: (B, C, D, H, W), float16, bfloat16, float32 or float64.
+        grid: the `VoxelGrid` or `FrustumGrid` on which the volume lives; depths of a frustum are (P,) or (B, P).
+        points: (B, N, 3) as x, y, z in world units, float32 or float64.
+        mode: "trilinear", or "nearest": the voxel that contains the point.
+        padding_mode: "zeros" (fades from the outermost centres to one voxel out) or "border".
+        near: least depth of a visible point of a frustum, world units; a `VoxelGrid` has no depth.
+
+    Returns:
+        ``values`` (B, C, N), of the volume's dtype, and ``visible`` (B, N) bool. Differentiable in the volume, the
+        points, the grid's pose, its camera and depths.
+
+    Raises:
+        ShapeError, DTypeError, DeviceError, GridError, OptionError: see `lsmgeo.errors`.
+
+    Example:
+        >>> import torch
+        >>> from lsmgeo import VoxelGrid, functional
+        >>> grid = VoxelGrid(4)
+        >>> volume = grid.centers()[..., 0][None, None]  # each voxel holds its x
+        >>> points = torch.tensor([[[0.25, 0.0, 0.0], [-0.3, 0.1, 0.2], [0.0, 0.0, 0.7]]])
+        >>> functional.sample_volume(volume, grid, points)
+        Sampled(values=tensor([[[ 0.2500, -0.3000,  0.0000]]]), visible=tensor([[ True,  True, False]]))
+    """
+    who = "sample_volume"
+    options = Options.checked(who, "trilinear", mode, padding_mode, near=near)
+    matrix, planes = volume_from_points(who, volume, grid, points)
+    dtype = computing_dtype(volume)
+    index, front = volume_index(matrix, planes, points, options, dtype)
+    index, front = [axis[..., None, None] for axis in index], front[..., None, None]  # (B, 1, N, 1, 1)
+    values, visible = sample_cells(volume.to(dtype)[:, None], index, front, options)
+    return Sampled(saturating_cast(values[:, 0].flatten(2), volume.dtype), visible.flatten(1))

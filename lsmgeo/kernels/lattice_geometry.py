@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from lsmgeo._dtypes import saturating_cast
 from lsmgeo.kernels.request import Options, Sites
 
 # The index of sites that read nothing: every tap is outside the array, for any interpolation.
@@ -213,6 +214,44 @@ def project_points(
         direction, every = recentered_matrix(direction, origin), slice(0, points.shape[1])
         extra.append(point_directions(direction, points, every, view_mask, torch.float32))
     return torch.stack((x, y), -1), front, torch.cat(extra, 2) if extra else None
+
+
+def volume_index(
+    matrix: Tensor, planes: Tensor | None, points: Tensor, options: Options, dtype: torch.dtype
+) -> tuple[list[Tensor], Tensor]:
+    """The index x, y, z in a volume of points (B, N, 3), each (B, 1, N), and which points are in front.
+
+    The matrix (B, 1, 3, 4) maps (X, 1) to the index where `planes` is None, and else to the homogeneous pixel of a
+    frustum with planes at these depths, (P,) or (B, P).
+    """
+    origin, points = recenter(points)
+    matrix = recentered_matrix(matrix, origin)
+    scale = scale_below_overflow(point_extent(matrix, points))[..., None]  # (B, 1, 1)
+    rows, unit = point_rows(matrix * scale[..., None], points, dtype), scale.to(dtype)
+    if planes is None:
+        return [row / unit for row in rows], torch.ones_like(rows[0], dtype=torch.bool)
+    index, front = perspective_division(rows, unit, None, options)
+    depth = torch.where(front, rows[2] / unit, 1.0)
+    return [*index, plane_index(depth[:, 0], planes)[:, None]], front
+
+
+def plane_index(depth: Tensor, planes: Tensor) -> Tensor:
+    """The fractional plane (B, N) of depths (B, N), linear in 1/depth between neighbours; 0 if there is one plane.
+
+    In the cell of planes at a and b it is ``k + (1/a - 1/d) / (1/a - 1/b) = k + b / (b - a) (d - a) / d``: exact at a.
+    """
+    if planes.shape[-1] == 1:
+        return torch.zeros_like(depth)
+    planes = planes.expand(depth.shape[0], planes.shape[-1])
+    lower, upper = planes[:, :-1], planes[:, 1:]
+    slope = (upper / (upper - lower)).to(depth.dtype)
+    lower = saturating_cast(lower, depth.dtype)
+    cell = torch.searchsorted(lower.detach().contiguous(), depth.detach().contiguous(), right=True)
+    cell = (cell - 1).clamp_min(0)  # the end cells go on outside
+    start = lower.gather(1, cell)
+    # Bounded, so that the quotient and its derivatives are finite; so far from the planes nothing is interpolated.
+    depth = torch.maximum(depth.clamp_max(torch.finfo(depth.dtype).max), 2.0**-40 * start)
+    return cell + slope.gather(1, cell) * ((depth - start) / depth)
 
 
 def pixels_in_front(

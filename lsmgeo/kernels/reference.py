@@ -40,7 +40,7 @@ from lsmgeo.kernels.recompute import recomputed
 from lsmgeo.kernels.request import Options, Sites
 from lsmgeo.kernels.view_statistics import view_statistics
 
-__all__ = ["OPERATORS", "why_not"]
+__all__ = ["OPERATORS", "sample_cells", "why_not"]
 
 
 def why_not(operator: str, source: Tensor, options: Options) -> str | None:
@@ -75,7 +75,7 @@ def _coordinate(index: Tensor, size: int, options: Options) -> Tensor:
     return torch.add(start, index, alpha=2.0 / size)
 
 
-def _sample(source: Tensor, index: Sequence[Tensor], front: Tensor, options: Options) -> tuple[Tensor, Tensor]:
+def sample_cells(source: Tensor, index: Sequence[Tensor], front: Tensor, options: Options) -> tuple[Tensor, Tensor]:
     """Interpolate arrays at fractional indices.
 
     Args:
@@ -193,7 +193,7 @@ def unproject(source: Tensor, sites: Sites, reference: Tensor | None, options: O
         part = sites.with_geometry(matrix, direction, sites.planes(z, start, stop))
         rows, unit = lattice_rows(matrix, part, dtype), _unit(part, scale, dtype)
         index, front = perspective_division(rows, unit, part.view_mask, options)
-        values, visible = _sample(source, index, front, options)
+        values, visible = sample_cells(source, index, front, options)
         depth = None
         if options.depth:
             depth = _own_depths(part, scale, dtype) if part.per_site() else rows[2] / unit
@@ -242,7 +242,7 @@ def unproject_points(
     ) -> tuple[Tensor, Tensor]:
         rows, unit = point_rows(matrix * scale[..., None], points[:, start:stop], dtype), scale.to(dtype)
         index, front = perspective_division(rows, unit, view_mask, options)
-        values, visible = _sample(source, index, front, options)
+        values, visible = sample_cells(source, index, front, options)
         depth = mask_views(rows[2] / unit, view_mask) if options.depth else None
         vectors = None
         if direction is not None:
@@ -268,7 +268,7 @@ def sample_views(
         distance, domain = depth[..., part].to(dtype), valid[..., part]
         front = domain & (distance > options.near)
         index = [torch.where(front, axis, OUTSIDE) for axis in pixels[:, :, part].to(dtype).unbind(-1)]
-        values, visible = _sample(source, index, front, options)
+        values, visible = sample_cells(source, index, front, options)
         distance = torch.where(domain, distance, 0.0)
         return _output(values, distance if options.depth else None, None, dtype if options.reduce else output), visible
 
@@ -292,7 +292,7 @@ def sample_pixels(
     """
     dtype = computing_dtype(source)
     index = [torch.where(front, axis, OUTSIDE) for axis in pixels.to(dtype).unbind(-1)]
-    values, visible = _sample(source.to(dtype), index, front, options)
+    values, visible = sample_cells(source.to(dtype), index, front, options)
     if extra is not None:
         values = torch.cat((values, extra.to(dtype)), 2)
     if options.reduce:
@@ -321,7 +321,7 @@ def _sweep(source: Tensor, sites: Sites, options: Options, output: torch.dtype) 
     dtype = source.dtype
     index, front, depth = _sweep_index(sites, options, dtype)
     views = source[:, None].expand(source.shape[0], sites.matrix.shape[1], *source.shape[1:])
-    values, visible = _sample(views, index, front, options)
+    values, visible = sample_cells(views, index, front, options)
     channel = mask_views(depth, sites.view_mask).expand(visible.shape)
     directions = lattice_directions(sites, dtype) if options.direction else None
     return _output(values, channel if options.depth else None, directions, output), visible

@@ -119,6 +119,16 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         },
     ),
     "plane_sweep_project": (functional.plane_sweep_project, {**SWEEP, "size": MAP, "flatten": True, **SWEPT}),
+    "sample_volume": (
+        functional.sample_volume,
+        {"volume": VOLUME, "grid": GRID, "points": torch.rand(B, 11, 3) - 0.5, "mode": "trilinear"}
+        | {"padding_mode": "zeros", "near": 1e-6},
+    ),
+    "sample_volume of a frustum": (
+        functional.sample_volume,
+        {"volume": torch.rand(B, C, P, *MAP), "grid": FrustumGrid(right_cameras(B), DEPTHS, MAP)}
+        | {"points": torch.rand(B, 11, 3) - 0.5},
+    ),
     "view_statistics": (functional.view_statistics, {**BLOCKS, "statistics": ("mean", "max"), "view_mask": MASK}),
     "Unproject": (
         _layer(Unproject, 3),

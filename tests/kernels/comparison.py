@@ -144,7 +144,7 @@ class _Kinks:
         self.close: list[Tensor] = []
 
     def __enter__(self) -> _Kinks:
-        self.inner = reference._sample
+        self.inner = reference.sample_cells
 
         def watching(source: Tensor, index: Sequence[Tensor], front: Tensor, options: Any) -> Any:
             close = torch.zeros_like(index[0], dtype=torch.bool)
@@ -155,11 +155,11 @@ class _Kinks:
             self.close.append(close & front.expand(close.shape))
             return self.inner(source, index, front, options)
 
-        reference._sample = watching
+        reference.sample_cells = watching
         return self
 
     def __exit__(self, *_: object) -> None:
-        reference._sample = self.inner
+        reference.sample_cells = self.inner
 
 
 def _answer(

@@ -145,7 +145,7 @@ def sample_pixels(source: Tensor, given: Points, options: Options) -> tuple[Tens
     """What `operators.sample_views` means, by the reference's parts."""
     dtype, output = computing_dtype(source), source.dtype
     index = [torch.where(given.front, axis, -2.0) for axis in given.pixels.to(dtype).unbind(-1)]
-    values, visible = reference._sample(source.to(dtype), index, given.front, options)
+    values, visible = reference.sample_cells(source.to(dtype), index, given.front, options)
     blocks = [values] if given.extra is None else [values, given.extra.to(dtype)]
     if options.reduce:
         return saturating_cast(view_statistics(torch.cat(blocks, 2), visible, options.reduce), output), visible

@@ -84,23 +84,21 @@ def _everything_in_front_is_visible(inner, source, index, front, call):
 
 
 def _divided(is_front, divisor):
-    """Sampling with other rules of what is in front and of what is divided by."""
+    """Other rules of what is in front and of what is divided by."""
 
-    def sample(inner, source, homogeneous, unit, mask, call):
+    def divide(inner, homogeneous, unit, mask, call):
         x, y, z = homogeneous
         front = is_front(z, call.near * unit)
         if mask is not None:
             front = front & mask.reshape(*mask.shape, *(1,) * (z.dim() - 2))
-        index = [torch.where(front, axis / divisor(z), lattice_geometry.OUTSIDE) for axis in (x, y)]
-        values, visible = reference._sample(source, index, front, call)
-        return values, visible, inner(source, homogeneous, unit, mask, call)[2]
+        return [torch.where(front, axis / divisor(z), lattice_geometry.OUTSIDE) for axis in (x, y)], front
 
-    return around(reference._sample_through_cameras, sample)
+    return around(lattice_geometry.perspective_division, divide)
 
 
-def _depth_plus_epsilon(inner, source, homogeneous, unit, mask, call):
+def _depth_plus_epsilon(inner, homogeneous, unit, mask, call):
     x, y, z = homogeneous
-    return inner(source, (x, y, z + 1e-3), unit, mask, call)
+    return inner((x, y, z + 1e-3), unit, mask, call)
 
 
 def _ray_length(inner, features, sampled_cameras, sites, **call):
@@ -231,6 +229,24 @@ def _from_slab_start(inner, self, start, stop):
     return inner(self, 0, stop - start)
 
 
+def _changed_index(change):
+    """Change the index x, y, z of points in a volume."""
+
+    def wrapper(inner, *args):
+        index, front = inner(*args)
+        return change(index), front
+
+    return around(lattice_geometry.volume_index, wrapper)
+
+
+def _linear_in_depth(inner, depth, planes):
+    index = inner(depth, planes)
+    cell = index.detach().floor().clamp(0, max(planes.shape[-1] - 2, 0)).long()
+    table = planes.to(depth.dtype).expand(depth.shape[0], planes.shape[-1])
+    lower, upper = (table.gather(1, (cell + step).clamp_max(planes.shape[-1] - 1)) for step in (0, 1))
+    return cell + (depth - lower) / torch.where(upper > lower, upper - lower, 1.0)
+
+
 FAULTS = {
     # projection
     "pixel centres at half integers": image_matrix(
@@ -249,7 +265,7 @@ FAULTS = {
     "skew with the wrong sign": _on_intrinsics(lambda K: _entry(K, 0, 1, -K[..., 0, 1])),
     "fx used for fy": _on_intrinsics(lambda K: _entry(K, 1, 1, K[..., 0, 0])),
     "cx and cy swapped": _on_intrinsics(lambda K: _entry(_entry(K, 0, 2, K[..., 1, 2]), 1, 2, K[..., 0, 2])),
-    "depth plus epsilon": around(reference._sample_through_cameras, _depth_plus_epsilon),
+    "depth plus epsilon": around(lattice_geometry.perspective_division, _depth_plus_epsilon),
     "cameras of scene and view mixed up": image_matrix(_mixed_views),
     "first camera for all views": image_matrix(lambda M, f: M[:, :1].expand_as(M)),
     # resizing
@@ -286,10 +302,10 @@ FAULTS = {
         lambda z, near: torch.ones_like(z, dtype=torch.bool), lambda z: torch.where(z == 0, 1.0, z)
     ),
     "near plane ignored": options(BOTH, near=0.0),
-    "everything in front counts as visible": around(reference._sample, _everything_in_front_is_visible),
-    "far image border counts as visible": around(reference._sample, _closed_image),
-    "outer half pixel counts as invisible": around(reference._sample, _centres_only),
-    "hidden samples masked by multiplication": around(reference._sample, _sample_unmasked),
+    "everything in front counts as visible": around(reference.sample_cells, _everything_in_front_is_visible),
+    "far image border counts as visible": around(reference.sample_cells, _closed_image),
+    "outer half pixel counts as invisible": around(reference.sample_cells, _centres_only),
+    "hidden samples masked by multiplication": around(reference.sample_cells, _sample_unmasked),
     "division before the guard": _divided(lambda z, near: z > near, lambda z: z),
     "view mask ignored": both(*(around(reference.OPERATORS[name], _unmasked) for name in BOTH)),
     # geometric channels
@@ -339,6 +355,16 @@ FAULTS = {
     ),
     "frustum depth not divided by its scale": _frustum_lattice(lambda g, lattice: lattice._replace(projective=False)),
     "slabs restart at the first plane": around_method(request.Sites, "slab", _from_slab_start),
+    # volumes at points
+    "half a voxel off at points": _changed_index(lambda index: [axis + 0.5 for axis in index]),
+    "x and z of points in a volume swapped": _changed_index(lambda index: index[::-1]),
+    "planes at points linear in depth": around(lattice_geometry.plane_index, _linear_in_depth),
+    "end planes hold outside": around(
+        lattice_geometry.plane_index, lambda inner, depth, planes: inner(depth, planes).clamp(0, planes.shape[-1] - 1)
+    ),
+    "depths at points get no gradient": around(
+        lattice_geometry.plane_index, lambda inner, depth, planes: inner(depth, planes.detach())
+    ),
     # sweep
     "half a voxel off in the sweep": sweep_sites(
         lambda s: s._replace(matrix=s.matrix + 0.5 * s.matrix.new_tensor([0.0, 0, 1, 0]))

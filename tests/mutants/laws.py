@@ -22,6 +22,7 @@ from tests.property import (
     test_plane_sweep,
     test_points,
     test_ray_tracing,
+    test_sample_volume,
     test_symmetry,
     test_unproject,
     test_view_statistics,
@@ -130,6 +131,14 @@ LAWS = (
         ),
     ),
     Law(test_points.test_sample_views_is_unproject_after_projection, (_SCENE, test_points.MODES)),
+    Law(test_sample_volume.test_planes_are_known, fixed=_DTYPES),
+    Law(test_sample_volume.test_voxels_are_known, fixed=_DTYPES),
+    Law(test_sample_volume.test_gradients_on_a_frustum, fixed=(("zeros",),)),
+    Law(test_sample_volume.test_voxels_are_read_as_the_oracle_reads_them, (_SCENE, test_sample_volume.MODES)),
+    Law(
+        test_sample_volume.test_frustums_are_read_as_the_oracle_reads_them,
+        (_CLOSE, test_sample_volume.MODES, st.sampled_from((1, 2, 5)), st.booleans()),
+    ),
     Law(test_unproject.test_unproject_is_the_oracle, (_SCENE, test_unproject.OPTIONS)),
     Law(test_unproject.test_unproject_with_dropped_views_is_the_oracle, (_SCENE, test_unproject.OPTIONS)),
     Law(

@@ -4,7 +4,7 @@ Nothing here imports the library or PyTorch. Every function is the textbook form
 ray bundle; :mod:`tests.oracle.operators` loops over scenes and views.
 """
 
-from tests.oracle.operators import plane_sweep, unproject, view_statistics
+from tests.oracle.operators import frustum_index, plane_sweep, sample_volume, unproject, view_statistics
 from tests.oracle.projection import (
     backproject,
     camera_center,
@@ -26,6 +26,7 @@ from tests.oracle.tracing import hit_box, hit_plane, hit_sphere
 __all__ = [
     "backproject",
     "camera_center",
+    "frustum_index",
     "frustum_sites",
     "hit_box",
     "hit_plane",
@@ -41,6 +42,7 @@ __all__ = [
     "resize_intrinsics",
     "rotation",
     "sample",
+    "sample_volume",
     "unproject",
     "view_statistics",
     "voxel_sites",

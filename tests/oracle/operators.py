@@ -114,6 +114,42 @@ def plane_sweep(
     return Sampled(values, visible)
 
 
+def frustum_index(
+    intrinsics: Array, rotation: Array, translation: Array, depths: Array, points: Array
+) -> tuple[Array, Array]:
+    """Pixel and plane (N, 3) of points (N, 3) in a frustum with these depths (P,), and their depth (N,).
+
+    The plane is linear in 1/depth between neighbours, and goes on so outside; 0 if there is only one.
+    """
+    pixels, depth = project(intrinsics, rotation, translation, points)
+    plane = np.zeros(len(points))
+    if len(depths) > 1:
+        with np.errstate(divide="ignore"):
+            inverse, table = 1.0 / depth, 1.0 / depths
+        plane = np.interp(-inverse, -table, np.arange(len(depths), dtype=np.float64))
+        first, last = table[0] - table[1], table[-2] - table[-1]
+        plane = np.where(inverse > table[0], (table[0] - inverse) / first, plane)
+        plane = np.where(inverse < table[-1], len(depths) - 1 + (table[-1] - inverse) / last, plane)
+    return np.concatenate([pixels, plane[:, None]], 1), depth
+
+
+def sample_volume(
+    volume: Array,
+    index: Array,
+    front: npt.NDArray[np.bool_],
+    mode: str = "trilinear",
+    padding_mode: str = "zeros",
+) -> Sampled:
+    """Volume (B, C, D, H, W) at x, y, z indices (B, N, 3), 0 where not in front (B, N): (B, C, N), (B, N)."""
+    values = np.zeros((*volume.shape[:2], index.shape[1]))
+    visible = np.zeros(front.shape, dtype=bool)
+    for b in range(len(volume)):
+        chosen = front[b]
+        values[b, :, chosen] = sample(volume[b], index[b, chosen], _kind(mode), padding_mode).T
+        visible[b, chosen] = is_inside(index[b, chosen], volume.shape[2:])
+    return Sampled(values, visible)
+
+
 def view_statistics(values: Array, visible: npt.NDArray[np.bool_], names: tuple[str, ...]) -> Array:
     """Mean, population variance and maximum over the visible views, as blocks of channels: (B, len(names) * C, N)."""
     batch, _, channels, count = values.shape

@@ -18,8 +18,8 @@ INVENTORY = {
         "cameras", "debug", "depth_planes", "errors", "functional", "fusion", "kernels", "rays",
     },
     functional: {
-        "Projected", "Unprojected", "plane_sweep_project", "sample_views", "splat", "unproject", "unproject_points",
-        "unproject_slabs", "view_statistics",
+        "Projected", "Sampled", "Unprojected", "plane_sweep_project", "sample_views", "sample_volume", "splat",
+        "unproject", "unproject_points", "unproject_slabs", "view_statistics",
     },
     cameras: {
         "CameraTensors", "as_tensors", "centers", "crop", "from_colmap", "from_opencv", "from_opengl", "from_pytorch3d",
@@ -62,6 +62,7 @@ SIGNATURES = {
     lsmgeo.PlaneSweepProject.forward: "(self, volume, cameras, view_mask=None, *, grid=None, depths=None, size=None)",
     lsmgeo.Splat: "(grid=None, depths=None, *, mode='trilinear', padding_mode='zeros', near=1e-06, backend='auto')",
     lsmgeo.Splat.forward: ("(self, features, cameras, view_mask=None, *, weights=None, grid=None, depths=None)"),
+    functional.sample_volume: "(volume, grid, points, *, mode='trilinear', padding_mode='zeros', near=1e-06)",
     functional.splat: (
         "(features, cameras, grid, depths, *, weights=None, view_mask=None, mode='trilinear', padding_mode='zeros', "
         "near=1e-06, backend='auto')"

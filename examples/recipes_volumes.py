@@ -7,9 +7,10 @@ cameras (B, V), and grids whose z axis is up.
 import torch
 from torch import Tensor
 
-from lsmgeo import Unproject, VoxelGrid
-from lsmgeo.cameras import CameraTensors, project, resize
-from lsmgeo.functional import sample_views, splat, unproject_points
+from lsmgeo import FrustumGrid, Unproject, VoxelGrid
+from lsmgeo.cameras import CameraTensors, project, rays, resize
+from lsmgeo.functional import sample_views, sample_volume, splat, unproject_points
+from lsmgeo.rays import composite
 
 
 def scaled(cameras: CameraTensors, x: float, y: float, size: tuple[int, int]) -> CameraTensors:
@@ -102,3 +103,33 @@ def pixelnerf_inputs(features: Tensor, cameras: CameraTensors, points: Tensor, d
     latent, _ = unproject_points(features, cameras, points, padding_mode="border")
     R, t = cameras.cam_from_world[..., :3, :3], cameras.cam_from_world[..., :3, 3:]
     return torch.cat((latent, R @ points[:, None].mT + t, R @ directions[:, None].mT), 2)
+
+
+def mvsnerf_inputs(volume: Tensor, images: Tensor, cameras: CameraTensors, depths: Tensor, points: Tensor) -> Tensor:
+    """MVSNeRF's inputs (B, C + 4 V, N) at points (B, N, 3) of rays.
+
+    The volume (B, C, P, h, w) of the first view's frustum, and of each view the image's colour and whether it sees the
+    point.
+    """
+    frustum = FrustumGrid(cameras.at((slice(None), 0)), depths, size=tuple(volume.shape[-2:]))
+    latent, _ = sample_volume(volume, frustum, points)
+    colours, seen = unproject_points(images, cameras, points, padding_mode="border")
+    return torch.cat((latent, torch.cat((colours, seen[:, :, None]), 2).flatten(1, 2)), 1)
+
+
+def mpi_view(
+    mpi: Tensor, reference: CameraTensors, depths: Tensor, target: CameraTensors, size: tuple[int, int]
+) -> Tensor:
+    """The image (B, 3, H, W) that `target` sees of multiplane images (B, 4, P, h, w), RGB and alpha, of `reference`.
+
+    Cameras have the leading shape (B,), depths (P,).
+    """
+    eye, directions = rays(target, size)  # (B, 3), (B, H, W, 3)
+    forward = reference.cam_from_world[:, 2]  # depth in the reference: forward . (X, 1)
+    start = (forward[:, :3] * eye).sum(-1) + forward[:, 3]
+    slope = (directions * forward[:, None, None, :3]).sum(-1)
+    along = (depths[:, None, None] - start[:, None, None, None]) / slope[:, None]  # (B, P, H, W)
+    points = eye[:, None, None, None] + along[..., None] * directions[:, None]
+    frustum = FrustumGrid(reference, depths, size=tuple(mpi.shape[-2:]))
+    values = sample_volume(mpi, frustum, points.flatten(1, 3)).values.unflatten(-1, along.shape[1:])
+    return composite(values[:, 3], values[:, :3], depths, along > 0).values

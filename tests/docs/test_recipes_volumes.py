@@ -207,10 +207,53 @@ def test_pixelnerf_inputs():
     close(recipes.pixelnerf_inputs(FEATURES, CAMERAS, points, directions), expected)
 
 
+def test_mvsnerf_inputs():
+    size, inverse = (5, 6), 1 / DEPTHS.numpy()
+    volume, points = random(B, 4, len(DEPTHS), *size), 1.3 * random(B, 30, 3) - 0.65
+    expected = np.zeros((B, 4 + V * (C + 1), 30))
+    for b, n in np.ndindex(B, 30):
+        own = oracle.resize_intrinsics(K[b, 0], IMAGE, size)
+        pixel, depth = oracle.project(own, R[b, 0], T[b, 0], points[b, n : n + 1].numpy())
+        assert depth > 0
+        k = np.clip(np.searchsorted(DEPTHS.numpy(), depth[0]) - 1, 0, len(DEPTHS) - 2)
+        plane = k + (1 / depth[0] - inverse[k]) / (inverse[k + 1] - inverse[k])
+        expected[b, :4, n] = oracle.sample(volume[b].numpy(), np.array([[*pixel[0], plane]]))[:, 0]
+    values, visible = sampled(points.numpy(), padding_mode="border")
+    expected[:, 4:] = np.concatenate((values, visible[:, :, None]), 2).reshape(B, -1, 30)
+    assert (expected[:, :4] == 0).all(1).any()  # points outside the frustum
+    close(recipes.mvsnerf_inputs(volume, FEATURES, CAMERAS, DEPTHS, points), expected)
+
+
+@pytest.mark.parametrize("advance", [0.1, 1.0])  # with all planes in front, and with some behind
+def test_mpi_view(advance):
+    size, small = (6, 8), (5, 6)
+    mpi = random(B, 4, len(DEPTHS), *small)
+    turned = np.eye(4)
+    turned[:3, :3], turned[:3, 3] = oracle.rotation(np.array((0.03, -0.05, 0.1))), (0.1, -0.05, -advance)
+    reference = CAMERAS.at((slice(None), 0))
+    target = reference._replace(cam_from_world=torch.from_numpy(turned @ E[:, 0]))
+    expected, behind = np.zeros((B, 3, size[0] * size[1])), False
+    for b in range(B):
+        first = (oracle.resize_intrinsics(K[b, 0], IMAGE, small), R[b, 0], T[b, 0])
+        moved = turned @ E[b, 0]
+        second = (oracle.resize_intrinsics(K[b, 0], IMAGE, size), moved[:3, :3], moved[:3, 3])
+        for k in reversed(range(len(DEPTHS))):  # back to front
+            to_first = np.linalg.inv(oracle.homography(first, second, float(DEPTHS[k])))
+            u, v, w = to_first @ np.c_[oracle.pixel_lattice(size), np.ones(48)].T
+            sites = oracle.backproject(*first, np.stack((u / w, v / w), -1), np.full(48, float(DEPTHS[k])))
+            front = oracle.project(*second, sites)[1] > 0
+            behind |= not front.all()
+            red_green_blue_alpha = oracle.sample(mpi[b, :, k].numpy(), np.stack((u / w, v / w), -1))
+            alpha = red_green_blue_alpha[3] * front
+            expected[b] = alpha * red_green_blue_alpha[:3] + (1 - alpha) * expected[b]
+    assert behind == (advance > 0.5)
+    close(recipes.mpi_view(mpi, reference, DEPTHS, target, size), expected)
+
+
 def test_recipes_are_short_and_shown():
     page = (ROOT / "docs" / "recipes_volumes.rst").read_text(encoding="utf-8")
     functions = [node for node in ast.parse(PATH.read_text(encoding="utf-8")).body if isinstance(node, ast.FunctionDef)]
-    assert len(functions) == 9
+    assert len(functions) == 11
     for function in functions:
         first = function.body[1].lineno  # after the docstring
         assert function.end_lineno - first + 1 <= 10, function.name

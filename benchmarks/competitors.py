@@ -64,21 +64,24 @@ def ours(scene: Scene, backend: str = "auto", fused: bool = True) -> Run:
         mapped = conv2d(maps.flatten(0, 1), scene.weight[..., None, None])
         return mapped.unflatten(0, maps.shape[:2]), visible
 
+    def scattered(volume: Tensor) -> Any:
+        return functional.sample_volume(volume, scene.grid, scene.points, mode=options["mode"])
+
     if problem.statistic == "dot":
         return products
-    return {"sweep": swept, "reduce": reduced}.get(problem.operator, lifted)
+    return {"sweep": swept, "reduce": reduced, "points": scattered}.get(problem.operator, lifted)
 
 
 def mode_of(scene: Scene) -> str:
     """The library's name of a mode."""
-    smooth = "trilinear" if scene.problem.is_sweep else "bilinear"
+    smooth = "trilinear" if scene.problem.reads_volume else "bilinear"
     return {"smooth": smooth, "nearest": "nearest"}[scene.problem.mode]
 
 
 def kernel(scene: Scene) -> dict[str, Callable[[], Any]]:
     """Only the CPU kernel, forward, and with backward to the source: sites are precomputed, memory is reused."""
     problem, source = scene.problem, scene.source
-    if problem.device != "cpu" or problem.operator == "reduce" or problem.statistic == "dot":
+    if problem.device != "cpu" or problem.operator in ("reduce", "points") or problem.statistic == "dot":
         raise LeftOut("not one call of a kernel")
     reduce, is_sweep = problem.statistic or None, problem.is_sweep
     options = Options.checked("benchmark", "trilinear" if is_sweep else "bilinear", mode_of(scene), reduce=reduce)

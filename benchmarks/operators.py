@@ -118,6 +118,7 @@ SYSTEMS = (
     ("Frustum, variance", FRUSTUM.but(statistic="variance"), (who.HAND, who.WARPER, who.HOMOGRAPHY, who.MVSNET)),
     ("Frustum, products with the first view", FRUSTUM.but(statistic="dot"), (who.DOT,)),
     ("Voxels, mean of nearest pixels", MEAN.but(mode="nearest"), (who.HAND, who.ATLAS)),
+    ("Volume at scattered points", Problem("points", size=56), (who.HAND,)),
 )
 
 

@@ -28,14 +28,14 @@ class Problem:
     """Sizes and options."""
 
     # "unproject" (images to voxels), "sweep" (voxels to images), "reduce" (a sweep and a linear map of its stacked
-    # channels) or "frustum" (images to the frustum of the first view).
+    # channels), "frustum" (images to the frustum of the first view) or "points" (voxels at scattered points).
     operator: str
     B: int = 4  # scenes
     V: int = 4  # views of a scene
     C: int = 32  # channels
     size: int = 112  # side of the feature maps; of the maps for a sweep
     voxels: int = 32  # side of the grid
-    planes: int = 64  # of a sweep or frustum
+    planes: int = 64  # of a sweep or frustum; there are planes * size^2 points
     mode: str = "smooth"  # or "nearest"
     statistic: str = ""  # over the views; "" keeps them; "dot": the mean product with the first view
     flatten: bool = False  # whether a sweep stacks its planes into the channels
@@ -50,6 +50,10 @@ class Problem:
     @property
     def is_sweep(self) -> bool:
         return self.operator in ("sweep", "reduce")
+
+    @property
+    def reads_volume(self) -> bool:
+        return self.is_sweep or self.operator == "points"
 
     @property
     def torch_dtype(self) -> torch.dtype:
@@ -98,8 +102,8 @@ class Scene:
     @cached_property
     def source(self) -> Tensor:
         """Features (B, V, C, size, size), or a volume (B, C, voxels, voxels, voxels)."""
-        problem, axis = self.problem, 1 if self.problem.is_sweep else 2
-        sides = (problem.voxels,) * 3 if problem.is_sweep else (problem.size,) * 2
+        problem, axis = self.problem, 1 if self.problem.reads_volume else 2
+        sides = (problem.voxels,) * 3 if problem.reads_volume else (problem.size,) * 2
         made = _random((*(problem.B, problem.V)[:axis], problem.C, *sides), 1)
         made = channels_last(made, axis) if problem.layout == "channels_last" else made
         return made.to(problem.device, problem.torch_dtype)
@@ -124,6 +128,12 @@ class Scene:
         if problem.operator == "frustum":
             return depth_planes(1.75, 2.25, problem.planes, spacing="inverse").to(problem.device)
         return depth_planes(1.0, 3.0, problem.planes).to(problem.device)  # the cameras are 2 from a cube of side 1
+
+    @cached_property
+    def points(self) -> Tensor:
+        """Scattered over the cube and a little around it, (B, sites, 3)."""
+        problem, generator = self.problem, torch.Generator().manual_seed(4)
+        return (1.2 * torch.rand(problem.B, problem.sites, 3, generator=generator) - 0.6).to(problem.device)
 
     @cached_property
     def weight(self) -> Tensor:

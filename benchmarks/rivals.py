@@ -103,6 +103,14 @@ def camera_centers(E: Tensor) -> Tensor:
     return -(E[..., :3, :3].transpose(-1, -2) @ E[..., :3, 3:])[..., 0]
 
 
+def sample_volume(volume: Tensor, points: Tensor, mode: str) -> tuple[Tensor, Tensor]:
+    """A volume (B, C, D, H, W) over the cube of side 1 at points (B, N, 3): (B, C, N) and visibility."""
+    coordinates = 2.0 * points  # cell edges at -1 and 1, as in grid_sample
+    visible = ((coordinates >= -1.0) & (coordinates < 1.0)).all(-1)
+    values = grid_sample(volume.float(), coordinates[:, :, None, None], mode=MODES[mode], align_corners=False)
+    return values[..., 0, 0].to(volume.dtype), visible
+
+
 def competitor(scene: Scene) -> Run:
     """The hand-written solution of a problem."""
     problem = scene.problem
@@ -119,6 +127,8 @@ def competitor(scene: Scene) -> Run:
         maps, visible = plane_sweep_project(volume, K, E, scene.depths, image, size, problem.mode)
         return maps.flatten(2, 3) if problem.flatten else maps, visible
 
+    if problem.operator == "points":
+        return lambda volume: sample_volume(volume, scene.points, problem.mode)
     return swept if problem.operator == "sweep" else lifted
 
 

@@ -25,6 +25,7 @@ PROBLEMS = {
     "sweep": Problem("sweep", **TINY),
     "sweep nearest flattened": Problem("sweep", mode="nearest", flatten=True, **TINY),
     "reduce": Problem("reduce", **TINY),
+    "points": Problem("points", **TINY),
     "frustum": Problem("frustum", **TINY),
     "frustum variance": Problem("frustum", statistic="variance", **TINY),
     "frustum dot": Problem("frustum", statistic="dot", **TINY),

@@ -43,7 +43,20 @@ def matched(features: torch.Tensor, views: CameraTensors, **options: object) -> 
     return functional.unproject(features, views, frustum, reduce="variance", padding_mode="border", **options).volume
 
 
-CASES = {"lifted": (lifted, FEATURES), "swept": (swept, VOLUME), "matched": (matched, FEATURES)}
+def at_points(volume: torch.Tensor, views: CameraTensors, **options: object) -> torch.Tensor:
+    reference = CameraTensors(*(torch.as_tensor(field)[:, 0] for field in views))
+    points = GRID.centers().reshape(1, -1, 3).expand(2, -1, 3).to(volume.device)
+    frustum = FrustumGrid(reference, PLANES.to(volume.device)[:5], (6, 7))
+    read = [functional.sample_volume(volume, grid, 1.1 * points, **options).values for grid in (GRID, frustum)]
+    return torch.stack(read)
+
+
+CASES = {
+    "lifted": (lifted, FEATURES),
+    "swept": (swept, VOLUME),
+    "matched": (matched, FEATURES),
+    "at points": (at_points, VOLUME),
+}
 
 
 @pytest.mark.usefixtures("_precision")

@@ -7,7 +7,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lsmgeo import CameraTensors, PlaneSweepProject, Unproject, VoxelGrid, cameras, depth_planes
+from lsmgeo import (
+    CameraTensors,
+    FrustumGrid,
+    PlaneSweepProject,
+    Unproject,
+    VoxelGrid,
+    cameras,
+    depth_planes,
+    functional,
+)
 
 GRID = VoxelGrid((3, 4, 5), lower=(-0.5, -0.4, -0.3), upper=(0.4, 0.5, 0.6))
 UNPROJECTIONS: dict[str, dict[str, Any]] = {
@@ -33,6 +42,23 @@ class ThereAndBack(nn.Module):
         fused = volume if self.unproject.reduce is not None else volume.mean(1)
         maps, swept = self.project(fused, views)
         return volume, visible, maps, swept
+
+
+def read_at_points(volume: Tensor, points: Tensor, K: Tensor, E: Tensor, depths: Tensor, pose: Tensor) -> Tensor:
+    """A volume (B, C, D, H, W) at points (B, N, 3), on voxels and on a frustum, (2, B, C, N)."""
+    voxels = VoxelGrid(tuple(volume.shape[2:]), world_from_grid=pose)
+    frustum = FrustumGrid(CameraTensors(K, E, 24, 32), depths, tuple(volume.shape[3:]))
+    return torch.stack([functional.sample_volume(volume, grid, points).values for grid in (voxels, frustum)])
+
+
+def points_arguments(scenes: int) -> tuple[Tensor, ...]:
+    """Arguments of `read_at_points`."""
+    generator = torch.Generator().manual_seed(7)
+    seen = views(scenes, 1)
+    volume = torch.rand(scenes, 2, 4, 5, 6, generator=generator)
+    points = 0.8 * torch.rand(scenes, 11, 3, generator=generator) - 0.4
+    depths = torch.linspace(1.4, 2.4, 4) + 0.1 * torch.rand(scenes, 1, generator=generator)
+    return volume, points, seen.intrinsics[:, 0], seen.cam_from_world[:, 0], depths, torch.eye(4).repeat(scenes, 1, 1)
 
 
 def views(scenes: int, count: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> CameraTensors:

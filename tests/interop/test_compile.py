@@ -9,7 +9,16 @@ import torch
 
 from lsmgeo import CameraTensors, FrustumGrid, Unproject, VoxelGrid, depth_planes, functional, rays
 from lsmgeo.errors import CameraError
-from tests.interop.models import GRID, UNPROJECTIONS, ThereAndBack, arguments, assert_same, views
+from tests.interop.models import (
+    GRID,
+    UNPROJECTIONS,
+    ThereAndBack,
+    arguments,
+    assert_same,
+    points_arguments,
+    read_at_points,
+    views,
+)
 
 # One model always, all of them in the long run: each takes seconds to trace.
 ONE_SOON_ALL_LATER = ["augmented", *(pytest.param(name, marks=pytest.mark.long) for name in ("reduced", "nearest"))]
@@ -93,6 +102,33 @@ def test_depths_of_pixels_and_correlation_export():
     for found, expected in zip(program.module()(*given), matching_costs(*given), strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
         assert expected.abs().sum() > 0
+
+
+def test_volumes_at_points_compile():
+    """One graph, with its gradients, for any number of scenes."""
+
+    def energy(*leaves):
+        return read_at_points(*leaves).square().sum()
+
+    compiled = torch.compile(energy, fullgraph=True, backend="aot_eager", dynamic=True)
+    for scenes in (2, 3):
+        leaves = [tensor.requires_grad_() for tensor in points_arguments(scenes)]
+        actual, expected = (torch.autograd.grad(run(*leaves), leaves) for run in (compiled, energy))
+        for mine, other in zip(actual, expected, strict=True):
+            assert other.abs().max() > 0
+            torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
+def test_volumes_at_points_export():
+    class Read(torch.nn.Module):
+        def forward(self, *given):
+            return read_at_points(*given)
+
+    given = points_arguments(2)
+    found, expected = torch.export.export(Read(), given).module()(*given), read_at_points(*given)
+    assert bool((expected.abs().amax((1, 2, 3)) > 0.1).all())
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.long

@@ -22,7 +22,16 @@ from lsmgeo import (
 from lsmgeo import rays as along_rays
 from lsmgeo.errors import OptionError
 from tests.abilities import needs_second_derivatives
-from tests.interop.models import GRID, UNPROJECTIONS, ThereAndBack, arguments, assert_same, views
+from tests.interop.models import (
+    GRID,
+    UNPROJECTIONS,
+    ThereAndBack,
+    arguments,
+    assert_same,
+    points_arguments,
+    read_at_points,
+    views,
+)
 
 OPTIONS = {"augment": ("depth", "direction"), "padding_mode": "border"}
 DEPTHS = depth_planes(1.5, 2.5, 6)
@@ -56,6 +65,21 @@ def test_vmap_over_statistics_and_sweeps():
     assert expected.maps.abs().sum() > 0
     torch.testing.assert_close(maps, expected.maps, rtol=1e-5, atol=1e-5)
     assert torch.equal(visible, expected.visible)
+
+
+def test_vmap_over_volumes_at_points():
+    given = points_arguments(3)
+
+    def one(*scene):
+        return read_at_points(*(tensor[None] for tensor in scene))[:, 0]
+
+    expected = read_at_points(*given)
+    assert bool((expected.abs().amax((1, 2, 3)) > 0.1).all())
+    torch.testing.assert_close(torch.vmap(one, out_dims=1)(*given), expected, rtol=1e-5, atol=1e-5)
+    actual = torch.vmap(torch.func.grad(lambda *scene: one(*scene).square().sum(), argnums=4))(*given)
+    depths = given[4].clone().requires_grad_()
+    energy = read_at_points(*given[:4], depths, given[5]).square().sum()
+    torch.testing.assert_close(actual, torch.autograd.grad(energy, depths)[0], rtol=1e-4, atol=1e-4)
 
 
 def volume_of(features, K, E):

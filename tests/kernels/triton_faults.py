@@ -137,9 +137,7 @@ CHANGES = {
         GRADIENTS, "to_depth += grad_z * _clamped", "to_depth += 0.0 * _clamped", "own sweep"
     ),
     "sums in another order": Fault(TABLES, "columns = [0, 1, 3, 2]", "columns = [0, 1, 2, 3]", "own depths"),
-    "correlation not a mean": Fault(
-        KERNELS, "product / size if CONFIG.averages", "product if CONFIG.averages", "correlation"
-    ),
+    "correlation not a mean": Fault(KERNELS, "n), LARGEST) / divisor", "n), LARGEST)", "correlation"),
     "features of the first view": Fault(
         KERNELS, "start, mask = _view_start(lattice.reference, view, n)", "start, mask = view * 0", "splat"
     ),

@@ -292,12 +292,11 @@ def _chunk(number, n, CONFIG: tl.constexpr):
 def _correlations(source, lattice, view, projection, site, n, CONFIG: tl.constexpr):
     """Means, or sums, over groups of channels of reference times sample, (sites, groups)."""
     column, size = tl.arange(0, CONFIG.columns)[None, :], tl.maximum(n.channels // n.features, 1)
-    values = tl.zeros([CONFIG.sites, CONFIG.columns], tl.float32)
+    values, divisor = tl.zeros([CONFIG.sites, CONFIG.columns], tl.float32), size if CONFIG.averages else 1
     for number in range(n.chunks):
         channel, exists = _chunk(number, n, CONFIG)
         product = _sampled(source, view, projection, channel, exists, n, CONFIG)
-        product = _clamp(product * _reference(lattice, view, projection, site, channel, exists, n), LARGEST)
-        product = product / size if CONFIG.averages else product
+        product = _clamp(product * _reference(lattice, view, projection, site, channel, exists, n), LARGEST) / divisor
         for group in range(n.features):
             share = tl.sum(tl.where((channel // size == group)[None, :], product, 0.0), 1)
             values += tl.where(column == group, share[:, None], 0.0)

@@ -393,13 +393,16 @@ def splat(features: Tensor, sites: Sites, weights: Tensor | None, shape: Sequenc
     """
     dtype = computing_dtype(features)
     index, front, _ = _sweep_index(sites, options, dtype)
-    values = features.to(dtype)
-    if weights is not None:
-        values = values[:, :, :, None] * weights.to(dtype)[:, :, None]
-    values = torch.where(front[:, :, None], values, 0.0)
     sizes = tuple(reversed(shape))  # x, y, z
     index = [_bounded(axis, size, options) for axis, size in zip(index, sizes, strict=True)]
     lower = [axis.detach().floor() for axis in index]
+    # What has no cell to be added to is not read.
+    first = 0 if options.mode == "nearest" else -1
+    read = [(cell >= first) & (cell < size) for cell, size in zip(lower, sizes, strict=True)]
+    read = reduce(torch.logical_and, read, front)[:, :, None]
+    values = torch.where(read, features.to(dtype) if weights is None else features.to(dtype)[:, :, :, None], 0.0)
+    if weights is not None:
+        values = values * torch.where(read, weights.to(dtype)[:, :, None], 0.0)
     fraction = [axis - cell for axis, cell in zip(index, lower, strict=True)]
     B, C, total = features.shape[0], features.shape[2], prod(shape)
     scene = torch.arange(B, device=features.device)[:, None, None, None, None] * total
@@ -412,7 +415,7 @@ def splat(features: Tensor, sites: Sites, weights: Tensor | None, shape: Sequenc
             at = lower[axis].long() + step
             inside = inside & (at >= 0) & (at < size)
             cell = cell + at * prod(sizes[:axis])
-        part = torch.where(inside[:, :, None], values * weight[:, :, None], 0.0).movedim(2, -1)
+        part = (values * torch.where(inside, weight, 0.0)[:, :, None]).movedim(2, -1)
         volume = volume.index_add(0, torch.where(inside, cell, 0).flatten(), part.flatten(0, 4))
     return volume.view(B, *shape, C).movedim(-1, 1)
 

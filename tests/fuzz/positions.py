@@ -13,6 +13,7 @@ from lsmgeo import (
     CameraTensors,
     FrustumGrid,
     PlaneSweepProject,
+    Splat,
     Unproject,
     VoxelGrid,
     cameras,
@@ -57,6 +58,11 @@ def _layer(layer: Callable[..., Any], count: int) -> Callable[..., Any]:
     return run
 
 
+def _splat(**arguments: Any) -> Any:
+    called = {name: arguments.pop(name) for name in ("features", "cameras", "view_mask", "weights")}
+    return Splat(**arguments)(**called)
+
+
 def _grid(**arguments: Any) -> Any:
     grid = VoxelGrid(**arguments)
     assert repr(grid).startswith("VoxelGrid(")
@@ -85,6 +91,8 @@ SAMPLING: dict[str, Any] = {"view_mask": MASK, "padding_mode": "zeros", "augment
 SAMPLING |= {"near": 1e-6, "backend": "auto"}
 IMAGE = {"mode": "bilinear", "reduce": None, **SAMPLING}
 SWEPT = {"mode": "trilinear", **SAMPLING}
+ADDED = {"weights": torch.rand(B, V, P, *SIZE), "view_mask": MASK, "mode": "trilinear", "padding_mode": "zeros"}
+ADDED |= {"near": 1e-6, "backend": "auto"}
 SCORES = torch.rand(B, P, *MAP)
 SEEN = torch.rand(B, P, *MAP) > 0.3
 K, E = VIEWS.intrinsics, VIEWS.cam_from_world
@@ -129,6 +137,17 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         {"volume": torch.rand(B, C, P, *MAP), "grid": FrustumGrid(right_cameras(B), DEPTHS, MAP)}
         | {"points": torch.rand(B, 11, 3) - 0.5},
     ),
+    "splat": (functional.splat, {"features": FEATURES, "cameras": VIEWS, "grid": GRID, "depths": DEPTHS, **ADDED}),
+    "splat without weights": (
+        functional.splat,
+        {
+            "features": torch.rand(B, V, C, P, *SIZE),
+            "cameras": VIEWS,
+            "grid": GRID,
+            "depths": DEPTHS,
+            "mode": "nearest",
+        },
+    ),
     "view_statistics": (functional.view_statistics, {**BLOCKS, "statistics": ("mean", "max"), "view_mask": MASK}),
     "Unproject": (
         _layer(Unproject, 3),
@@ -137,6 +156,10 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "PlaneSweepProject": (
         _layer(PlaneSweepProject, 3),
         {"volume": VOLUME, **CALLED, **PLANES, "flatten": True, "mode": "trilinear", **COMMON},
+    ),
+    "Splat": (
+        _splat,
+        {"features": FEATURES, **CALLED, "weights": ADDED["weights"], "grid": GRID, "depths": DEPTHS, "near": 0.1},
     ),
     "ProjectReduce": (
         _layer(rays.ProjectReduce, 3),

@@ -23,9 +23,9 @@ from tests.fuzz.junk import JUNK, NEVER, mutations
 from tests.fuzz.positions import CALLS, POSITIONS, SHAPE, B, C, P, Position, V, tensors_of
 
 # Arrays whose values pass through the operators, so that what is not finite there is not finite in the answer.
-VALUES = {"features", "volume", "scores", "maps", "alpha", "values", "weight", "bias"}
+VALUES = {"features", "volume", "scores", "maps", "alpha", "values", "weight", "weights", "bias"}
 # Sums of products with these have no bound below overflow.
-UNBOUNDED = {"project_reduce", "ProjectReduce", "composite"}
+UNBOUNDED = {"project_reduce", "ProjectReduce", "composite", "splat", "splat without weights", "Splat"}
 # Calls that take any leading shape: how many leading axes the right call has.
 LEADING = {"expected_depth": 1, "max_along_rays": 1, "composite": 1, "look_at": 1, "orbit": 1, "depth_planes": 0}
 LEADING |= {"VoxelGrid": 0, "from_opencv": 2, "from_opengl": 2, "from_colmap": 2, "from_pytorch3d": 2}
@@ -44,7 +44,12 @@ SHAPES: dict[tuple[str, str, str], list[tuple[int, ...]]] = {
     ("stack", "dim", "zero"): [(2, V, 3, 3), (2, V, 4, 4), (2, V), (2, V)],
 }
 # Whom a message blames where it is not the call's own name.
-BLAMED = {"unproject": "Unproject", "plane_sweep_project": "PlaneSweepProject", "from_kornia": "(from_kornia|cameras)"}
+BLAMED = {
+    "unproject": "Unproject",
+    "plane_sweep_project": "PlaneSweepProject",
+    "splat": "Splat",
+    "from_kornia": "(from_kornia|cameras)",
+}
 BLAMED |= {"Mean": "view_statistics", "ProjectReduce": "(ProjectReduce|project_reduce)"}
 WHAT_CAME = r"got |\bis -?\d|that is|must be finite|must not be zero|must span"
 

@@ -62,14 +62,14 @@ def test_gradients_of_a_graph():
 
 
 def matching_costs(features, K, E, depths, reference):
-    """Depths of pixels and correlation: what a cascade computes."""
+    """Depths of pixels and correlation, what a cascade computes, and a splat."""
     cameras = CameraTensors(K, E, 24, 32)
     grid = FrustumGrid(CameraTensors(K[:, 0], E[:, 0], 24, 32), depths)
     cost = functional.unproject(features, cameras, grid, reference=reference, groups=2, reduce=("mean", "max"))
-    maps = functional.plane_sweep_project(cost.volume, cameras, VoxelGrid(grid.shape), depths[:, None].expand(
-        -1, features.shape[1], -1, -1, -1
-    ))  # fmt: skip
-    return cost.volume, maps.maps
+    own = depths[:, None].expand(-1, features.shape[1], -1, -1, -1)
+    maps = functional.plane_sweep_project(cost.volume, cameras, VoxelGrid(grid.shape), own)
+    added = functional.splat(features[..., :5, :6], cameras, VoxelGrid(grid.shape), own, weights=1.0 / own)
+    return cost.volume, maps.maps, added
 
 
 def matching_inputs():

@@ -56,12 +56,17 @@ def test_vmap_over_statistics_and_sweeps():
         scene = CameraTensors(K[None], E[None], 24, 32)
         fused = functional.unproject(features[None], scene, GRID, reduce=("mean", "max")).volume
         maps, visible = functional.plane_sweep_project(fused, scene, GRID, DEPTHS, (7, 9))
-        return maps[0], visible[0]
+        added = functional.splat(features[None], scene, GRID, DEPTHS, weights=weights)
+        return maps[0], visible[0], added[0]
 
+    weights = torch.rand(1, 2, 6, *features.shape[-2:], generator=torch.Generator().manual_seed(1))
     scenes = CameraTensors(K, E, height, width)
     fused = functional.unproject(features, scenes, GRID, reduce=("mean", "max")).volume
     expected = functional.plane_sweep_project(fused, scenes, GRID, DEPTHS, (7, 9))
-    maps, visible = torch.vmap(one)(features, K, E)
+    maps, visible, added = torch.vmap(one)(features, K, E)
+    splatted = functional.splat(features, scenes, GRID, DEPTHS, weights=weights.expand(3, -1, -1, -1, -1))
+    assert splatted.abs().sum() > 0
+    torch.testing.assert_close(added, splatted, rtol=1e-5, atol=1e-5)
     assert expected.maps.abs().sum() > 0
     torch.testing.assert_close(maps, expected.maps, rtol=1e-5, atol=1e-5)
     assert torch.equal(visible, expected.visible)

@@ -15,6 +15,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from lsmgeo import FrustumGrid, VoxelGrid, cameras, depth_planes, functional, rays
+from lsmgeo.kernels import Options
+from lsmgeo.kernels.native import library
 
 V, C, P = 12, 16, 24
 MAP = (20, 26)
@@ -175,6 +177,22 @@ class TestReductionOverRays:
         assert weight.grad.abs().max() > 1.0
         torch.testing.assert_close(weight.grad, kernel.grad, rtol=1e-3, atol=1e-3)
         torch.testing.assert_close(volume.grad, whole.grad, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.skipif(library.why_not("splat", FEATURES, Options("trilinear")) is not None, reason="no C++ kernels")
+def test_features_times_weights_are_never_held():
+    """Nor does backward."""
+    weights = torch.rand(1, V, P, 12, 16, generator=GENERATOR)
+
+    def splatted(backend: str) -> Tensor:
+        arguments = VIEWS, SWEPT_GRID, DEPTHS
+        return functional.splat(leaf(FEATURES), *arguments, weights=leaf(weights), backend=backend)
+
+    product = FEATURES.numel() * P
+    assert largest(lambda: splatted("reference"), backward=False) >= product
+    for backward in (False, True):
+        assert largest(lambda: splatted("cpu"), backward) <= product / 8
+    assert kept(lambda: splatted("cpu")) <= FEATURES.numel() + weights.numel() + 1e4
 
 
 def test_slabs_hold_one_slab():

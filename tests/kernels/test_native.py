@@ -118,6 +118,13 @@ RUNS = {
         ),
         cases.WIDE_VOLUME,
     ),
+    "splat": (
+        lambda source: (
+            functional.splat(source, *cases.SPLAT, weights=cases.SHARES, backend="cpu"),
+            torch.empty(0),
+        ),
+        cases.WIDE_MAPS,
+    ),
 }
 
 
@@ -134,7 +141,7 @@ def _twice(tensor: torch.Tensor) -> torch.Tensor:
 def test_strides_change_nothing(operator):
     run, source = operator
     cotangent = torch.rand(run(source)[0].shape)
-    axis = 2 if source is cases.WIDE else 1
+    axis = 1 if source is cases.WIDE_VOLUME else 2
     channels_last = source.movedim(axis, -1).contiguous().movedim(-1, axis)
     expected = _answers(run, source, cotangent)
     for other, incoming in ((channels_last, cotangent), (_twice(source), _twice(cotangent))):

@@ -4,7 +4,7 @@ Nothing here imports the library or PyTorch. Every function is the textbook form
 ray bundle; :mod:`tests.oracle.operators` loops over scenes and views.
 """
 
-from tests.oracle.operators import frustum_index, plane_sweep, sample_volume, unproject, view_statistics
+from tests.oracle.operators import frustum_index, plane_sweep, sample_volume, splat, unproject, view_statistics
 from tests.oracle.projection import (
     backproject,
     camera_center,
@@ -43,6 +43,7 @@ __all__ = [
     "rotation",
     "sample",
     "sample_volume",
+    "splat",
     "unproject",
     "view_statistics",
     "voxel_sites",

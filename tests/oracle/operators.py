@@ -16,7 +16,7 @@ from tests.oracle.projection import (
     ray_direction,
     resize_intrinsics,
 )
-from tests.oracle.sampling import is_inside, sample
+from tests.oracle.sampling import is_inside, sample, scatter
 
 NEAR = 1e-6
 
@@ -148,6 +148,37 @@ def sample_volume(
         values[b, :, chosen] = sample(volume[b], index[b, chosen], _kind(mode), padding_mode).T
         visible[b, chosen] = is_inside(index[b, chosen], volume.shape[2:])
     return Sampled(values, visible)
+
+
+def splat(
+    values: Array,
+    intrinsics: Array,
+    rotations: Array,
+    translations: Array,
+    image_sizes: npt.NDArray[np.int64],
+    lattice: Array,
+    depths: Array,
+    shape: tuple[int, int, int],
+    *,
+    view_mask: npt.NDArray[np.bool_] | None = None,
+    mode: str = "trilinear",
+    padding_mode: str = "zeros",
+    near: float = NEAR,
+) -> Array:
+    """Values (B, V, C, P, h, w) at depths (B, V, P, h, w), added to volumes (B, C, D, H, W)."""
+    batch, views, channels, _, *size = values.shape
+    volume = np.zeros((batch, channels, *shape))
+    pixels = np.tile(pixel_lattice(tuple(size)), (depths.shape[2], 1))
+    for b, v in np.ndindex(batch, views):
+        if view_mask is not None and not view_mask[b, v]:
+            continue
+        matrix = resize_intrinsics(intrinsics[b, v], tuple(image_sizes[b, v]), tuple(size))
+        points = backproject(matrix, rotations[b, v], translations[b, v], pixels, depths[b, v].reshape(-1))
+        index = np.linalg.solve(lattice[b, :3, :3], (points - lattice[b, :3, 3]).T).T
+        front = depths[b, v].reshape(-1) > near
+        added = values[b, v].reshape(channels, -1)[:, front]
+        volume[b] += scatter(added, index[front], shape, _kind(mode), padding_mode)
+    return volume
 
 
 def view_statistics(values: Array, visible: npt.NDArray[np.bool_], names: tuple[str, ...]) -> Array:

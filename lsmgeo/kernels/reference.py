@@ -398,8 +398,8 @@ def splat(features: Tensor, sites: Sites, weights: Tensor | None, shape: Sequenc
     lower = [axis.detach().floor() for axis in index]
     # What has no cell to be added to is not read.
     first = 0 if options.mode == "nearest" else -1
-    read = [(cell >= first) & (cell < size) for cell, size in zip(lower, sizes, strict=True)]
-    read = reduce(torch.logical_and, read, front)[:, :, None]
+    exists = [(cell >= first) & (cell < size) for cell, size in zip(lower, sizes, strict=True)]
+    read = reduce(torch.logical_and, exists, front)[:, :, None]
     values = torch.where(read, features.to(dtype) if weights is None else features.to(dtype)[:, :, :, None], 0.0)
     if weights is not None:
         values = values * torch.where(read, weights.to(dtype)[:, :, None], 0.0)

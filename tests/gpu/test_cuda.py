@@ -51,7 +51,13 @@ def at_points(volume: torch.Tensor, views: CameraTensors, **options: object) -> 
     return torch.stack(read)
 
 
+def added(features: torch.Tensor, views: CameraTensors, **options: object) -> torch.Tensor:
+    weights = torch.linspace(0.1, 1.0, 8, device=features.device)[:, None, None].expand(2, 3, 8, 12, 16)
+    return functional.splat(features, views, GRID, PLANES.to(features.device), weights=weights, **options)
+
+
 CASES = {
+    "added": (added, FEATURES),
     "lifted": (lifted, FEATURES),
     "swept": (swept, VOLUME),
     "matched": (matched, FEATURES),

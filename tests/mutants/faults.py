@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -13,6 +16,7 @@ from lsmgeo.kernels import lattice_geometry, reference, request
 from lsmgeo.kernels import view_statistics as statistics
 from tests.mutants import patching
 from tests.mutants.patching import (
+    Patch,
     around,
     around_method,
     both,
@@ -247,6 +251,15 @@ def _linear_in_depth(inner, depth, planes):
     return cell + (depth - lower) / torch.where(upper > lower, upper - lower, 1.0)
 
 
+def _splat(change: Callable[..., Any]) -> Patch:
+    return around(reference.splat, change)
+
+
+def _truncated(inner: Any, index: Tensor, size: int, options: Any) -> Tensor:
+    found = inner(index, size, options)
+    return found if options.mode != "nearest" else torch.where((found == -1) & (index > -1.5), 0.0, found)
+
+
 FAULTS = {
     # projection
     "pixel centres at half integers": image_matrix(
@@ -380,6 +393,23 @@ FAULTS = {
         sweep_sites(lambda s: s._replace(z=s.z.detach())),
         _frustum_lattice(lambda g, lattice: lattice._replace(z=lattice.z.detach())),
     ),
+    # splat
+    "half a voxel off in the splat": _splat(
+        lambda inner, f, sites, *rest: inner(
+            f, sites._replace(matrix=sites.matrix + 0.5 * sites.matrix.new_tensor([0.0, 0, 1, 0])), *rest
+        )
+    ),
+    "truncation for floor in the splat": around(reference._bounded, _truncated),
+    "splat divided by the planes": _splat(
+        lambda inner, f, sites, w, *rest: inner(f, sites, w / w.shape[2] if w is not None else w, *rest)
+    ),
+    "weights of the planes in reverse": _splat(
+        lambda inner, f, sites, w, *rest: inner(f, sites, w.flip(2) if w is not None else w, *rest)
+    ),
+    "weights get no gradient": _splat(
+        lambda inner, f, sites, w, *rest: inner(f, sites, w.detach() if w is not None else w, *rest)
+    ),
+    "near ignored by the splat": _splat(lambda inner, *rest: inner(*rest[:-1], rest[-1]._replace(near=0.0))),
     # depths of pixels, correlation
     "one pixel's depths for all": around(
         lattice_geometry.site_depths, lambda inner, *a: (lambda d: d[..., :1, :1].expand_as(d))(inner(*a))

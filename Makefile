@@ -12,7 +12,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo $$p; break; }; done)
 
 # The modules whose lines must be covered: what the operators consist of.
-CORE := lsmgeo/_*.py,lsmgeo/errors.py,lsmgeo/debugging.py,lsmgeo/grids.py,lsmgeo/functional.py,lsmgeo/layers.py,lsmgeo/fusion.py,lsmgeo/rays.py,lsmgeo/cameras/*,lsmgeo/kernels/*
+CORE := lsmgeo/_*.py,lsmgeo/errors.py,lsmgeo/debugging.py,lsmgeo/grids.py,lsmgeo/functional/*,lsmgeo/layers.py,lsmgeo/fusion.py,lsmgeo/rays.py,lsmgeo/cameras/*,lsmgeo/kernels/*
 CORE_COVERAGE := 95
 # Triton compiles these: their lines do not run as Python, and tests/kernels/test_triton*.py hold them by their answers.
 DEVICE_CODE := lsmgeo/kernels/triton/forward.py,lsmgeo/kernels/triton/backward.py

@@ -84,6 +84,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         module, function = BENCHMARKS[name].split(".")
         where = measuring.machine(settings.device)
         print(f"\n{name}: {report.machine_line(where)}", flush=True)
+        measuring.others.clear()
         cases = getattr(importlib.import_module(f"benchmarks.{module}"), function)(settings)
         report.show(cases)
         if folder is not None and cases:

@@ -172,11 +172,14 @@ TABLES: dict[str, Callable[[Cases], Rows]] = {
 
 
 def machine_line(machine: Mapping[str, Any]) -> str:
-    """Machine and date in a sentence."""
+    """Machine and date in a sentence, and what other processes used while it was measured."""
+    used = machine.get("others")
+    others = "" if used is None else f"; other processes used at most {100 * used:.0f} % of the processors"
     return (
         f"{machine['device']}, {machine['cores']} cores, {machine['threads']} threads, {machine['system']}, huge pages "
         f"on {machine['huge_pages']}; lsmgeo {machine['lsmgeo']}, PyTorch {machine['torch']}, kornia "
         f"{machine['kornia']}, Python {machine['python']}; {machine['date']}; load before: {machine['load_before']:.1f}"
+        + others
     )
 
 

@@ -52,8 +52,8 @@ def interleaved(
     """Seconds of each run, interleaved so that other load affects all equally; the order alternates.
 
     Without `repeats` there are as many rounds as fit into `budget` seconds, between `fewest` and `MOST`. The clock
-    waits for a GPU. Where other processes use more than `QUIET` of the processors meanwhile, the rounds are taken again,
-    unless their number is given, and the quietest of `TRIES` is kept.
+    waits for a GPU. Where other processes use more than `QUIET` of the processors meanwhile, the rounds are taken
+    again, unless their number is given, and the quietest of `TRIES` is kept.
     """
     order = list(runs)
 

@@ -52,6 +52,12 @@ def goal_rows(cases: Cases) -> Rows:
     return rows
 
 
+def missed_rows(cases: Cases) -> Rows:
+    """Of the table of goals, the lines of those missed."""
+    header, *rows = goal_rows(cases)
+    return [header[:-1], *(row[:-1] for row in rows if row[-1] == said(False))]
+
+
 def time_rows(cases: Cases) -> Rows:
     """One row per case, one column per competitor that ran in any."""
     cases = [case for case in cases if case.get("times") and "peak" not in case]
@@ -164,6 +170,7 @@ TABLES: dict[str, Callable[[Cases], Rows]] = {
     "rates": rate_rows,
     "compiling": first_call_rows,
     "goals": goal_rows,
+    "missed": missed_rows,
     "left-out": left_out_rows,
     "figures": figure_rows,
     "mistakes": mistake_rows,
@@ -186,6 +193,8 @@ def machine_line(machine: Mapping[str, Any]) -> str:
 def show(cases: Cases) -> None:
     """Print all tables that have rows for the cases."""
     for title, table in TABLES.items():
+        if title == "missed":  # they are among the goals
+            continue
         header, *rows = table(cases)
         if rows:
             widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]

@@ -46,15 +46,18 @@ def list_table(rows: report.Rows) -> list[str]:
 
 
 class Benchmark(SphinxDirective):
-    """``.. benchmark:: operators_channels_last goals``."""
+    """``.. benchmark:: operators_channels_last goals``; of "every" file, the cases of all."""
 
     required_arguments = 2
 
     def run(self) -> list[nodes.Node]:
         name = self.arguments[0]
         kind = directives.choice(self.arguments[1], (*report.TABLES, "machine"))
-        found = load(name)
-        self.env.note_dependency(str(RESULTS / f"{name}.json"))
+        files = sorted(RESULTS.glob("*.json")) if name == "every" else [RESULTS / f"{name}.json"]
+        for file in files:
+            self.env.note_dependency(str(file))
+        every = [load(file.stem) for file in files]
+        found = {"cases": [case for one in every if one for case in one["cases"]]} if name == "every" else every[0]
         if found is None:
             lines = [f"*Not measured yet: there is no* ``benchmarks/results/{name}.json``."]
         elif kind == "machine":

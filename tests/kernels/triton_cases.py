@@ -476,3 +476,27 @@ def deterministic_sums_of_correlations() -> None:
             continue
         torch.testing.assert_close(first, second, rtol=0, atol=0)
         torch.testing.assert_close(first, other, rtol=0, atol=1e-5 * float(other.abs().max()))
+
+
+@case
+def deterministic_sums_of_infinities() -> None:
+    """NaN, as sums of fixed-point numbers need a bound; a NaN that is not read changes none."""
+    source, sites, options = features(), image_sites(3, mask=True), Options("bilinear", "border")
+    other = torch.randn(B, source.shape[2], *SHAPE, generator=generator(3))
+    cotangent = torch.randn(B, V, 1, *SHAPE, generator=generator(2))
+
+    def run(source, other):
+        needs = (True, False, False, False, True)
+        found = operators.unproject_backward(cotangent, source, sites, other, options, needs)
+        return found[0], found[4]
+
+    expected = run(source, other)
+    with deterministic():
+        hidden = source.clone()
+        hidden[0, 0] = torch.nan  # a masked view
+        for found, plain in zip(run(hidden, other), expected, strict=True):
+            torch.testing.assert_close(found, plain, rtol=0, atol=1e-5)
+        other[0, 1, 0, 1, 2] = torch.inf
+        source[0, 1, 0, 2, 3] = -torch.inf
+        for found in run(source, other):
+            assert bool(found.isnan().all())

@@ -248,14 +248,14 @@ def accumulator(
         bound = bound * _largest(factor)
     exponent = 62.0 - math.ceil(math.log2(max(1, sites))) - torch.log2(bound).ceil()
     scale = torch.where(bound.isfinite(), torch.exp2(exponent.clamp(-126.0, 126.0)), torch.nan)
-    return Accumulator(array, scale.float().reshape(1))  # NaN if the gradient is not finite
+    return Accumulator(array, scale.float().reshape(1))  # NaN where an infinity leaves no bound
 
 
 def _largest(tensor: Tensor) -> Tensor:
-    """The largest finite magnitude, float64."""
+    """The largest magnitude, float64; a NaN, which hidden sites may have, is 0."""
     if not tensor.numel():
         return tensor.new_zeros((), dtype=torch.float64)
-    return tensor.float().nan_to_num(0.0, 0.0, 0.0).abs().amax().double()
+    return tensor.float().nan_to_num(0.0, math.inf, -math.inf).abs().amax().double()
 
 
 def allocate_sums(

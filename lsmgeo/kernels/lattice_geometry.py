@@ -15,8 +15,8 @@ from lsmgeo.kernels.request import Options, Sites
 
 # The index of sites that read nothing: every tap is outside the array, for any interpolation.
 OUTSIDE = -2.0
-# Homogeneous coordinates are kept below 2^100, and a site counts as in front only beyond 2^-60, so that neither the
-# quotient's derivative nor anything before it overflows in float32.
+# Homogeneous coordinates are kept below 2^100, and a site counts as in front, or as away from the camera centre, only
+# beyond 2^-60, so that neither the quotient's derivative nor anything before it overflows in float32.
 LARGEST_COORDINATE = 2.0**100
 SMALLEST_DEPTH = 2.0**-60
 
@@ -127,6 +127,7 @@ def lattice_directions(sites: Sites, dtype: torch.dtype) -> Tensor:
     flat = a[..., 0] * sites.x.abs().amax(0) + a[..., 1] * sites.y.abs().amax(0) + a[..., 3]
     z = z.detach().abs()
     terms = flat + a[..., 2] * z[..., None, None] if w is None else flat * w.detach() + a[..., 2] * z
+    terms = terms.clamp_min(SMALLEST_DEPTH / (4.0 * torch.finfo(dtype).eps))  # shorter vectors have no direction
     rows = lattice_rows(matrix, sites, dtype)
     if sites.per_site():  # vectors may be as short as w, whose square underflows
         factor = 1.0 / power_of_two_above(torch.stack(rows).detach().abs().amax(0))

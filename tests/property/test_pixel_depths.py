@@ -173,6 +173,23 @@ def test_extreme_depths_give_finite_answers(scale, backend):
         assert bool(depths.grad.isfinite().all())
 
 
+@pytest.mark.parametrize("scale", [1e-12, 1e-19, 3e-23, 1e-30, 1e-38])
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_directions_next_to_the_camera_are_unit_vectors_or_0(scale, backend):
+    depths = torch.full((2, 4, *cases.SIZE), scale).clamp_min(torch.finfo(torch.float32).tiny).requires_grad_()
+    poses = cases.CAMERA.cam_from_world.clone().requires_grad_()
+    volume, _ = functional.unproject(
+        cases.FEATURES[:, :1], cases.CAMERA._replace(cam_from_world=poses), FrustumGrid(cases.CAMERA, depths),
+        augment="direction", backend=backend,
+    )  # fmt: skip
+    directions = volume[:, :, cases.C :]
+    expected = torch.ones(2, 1, 4, *cases.SIZE) if scale > 2.0**-59 else torch.zeros(2, 1, 4, *cases.SIZE)
+    torch.testing.assert_close(directions.norm(dim=2), expected, rtol=0, atol=1e-6)
+    weights = torch.rand(directions.shape, generator=torch.Generator().manual_seed(1))
+    for gradient in torch.autograd.grad((directions * weights).sum(), (depths, poses)):
+        assert bool(gradient.isfinite().all())
+
+
 @pytest.mark.parametrize("backend", ["auto", "reference"])
 def test_depths_of_a_masked_scene_are_not_read(backend):
     depths = cases.PIXEL_DEPTHS[:, 0].clone()

@@ -52,7 +52,4 @@ struct Call {
     int64_t reference_gradient_stride[5];   // scene, view, z, y, x
     float *pixels_gradient;        // (chunks, B, V, N, 2), or null
     float *extras_gradient;        // (B, V, N, E), or null
-
-    int64_t has_invalid_depth;     // answers: whether a depth was not positive and finite, and one that was not
-    double invalid_depth;
 };

@@ -47,13 +47,9 @@ struct View {
     bool masked;
 };
 
-// A depth that is not positive and finite, if one was found.
-struct InvalidDepth { std::atomic<bool> found{false}; double depth = 0.0; };
-
 struct Plan {
     const Call *call;
     const View *views;       // (B, V)
-    InvalidDepth *invalid;
     int64_t features;        // channels of a view's values: those of the source, or groups of them correlated
     int64_t channels;        // of a view's values, with the geometric ones
     int64_t tiles, tiles_per_row, blocks;
@@ -178,10 +174,8 @@ void prepare_view(const Call &call, int64_t scene, int64_t number, double reach_
 }
 
 // Run a call; nonzero when memory ran out.
-int run(Call &call, bool backward) {
+int run(const Call &call, bool backward) {
     Plan plan = {};
-    InvalidDepth invalid;
-    plan.invalid = &invalid;
     plan.call = &call;
     plan.backward = backward;
     plan.features = call.groups ? call.groups : call.channels;
@@ -256,16 +250,14 @@ int run(Call &call, bool backward) {
         }
     };
     run_on_threads(threads, body);
-    call.has_invalid_depth = invalid.found.load();
-    call.invalid_depth = invalid.depth;
     return arrived.load() == 0 ? 1 : 0;  // one thread with memory does all the work
 }
 
 }  // namespace
 
-EXPORT int lsmgeo_forward(Call *call) { return run(*call, false); }
+EXPORT int lsmgeo_forward(const Call *call) { return run(*call, false); }
 
-EXPORT int lsmgeo_backward(Call *call) { return run(*call, true); }
+EXPORT int lsmgeo_backward(const Call *call) { return run(*call, true); }
 
 EXPORT int64_t lsmgeo_size_of_call() { return int64_t(sizeof(Call)); }
 

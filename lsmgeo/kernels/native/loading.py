@@ -61,8 +61,6 @@ class Call(ctypes.Structure):
         ("reference_gradient", _ADDRESS),
         ("reference_gradient_stride", 5 * _INTEGER),
         *((name, _ADDRESS) for name in ("pixels_gradient", "extras_gradient")),
-        ("has_invalid_depth", _INTEGER),
-        ("invalid_depth", _NUMBER),
     )
 
 

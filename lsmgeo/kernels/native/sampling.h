@@ -44,21 +44,15 @@ inline void load_depths(const Plan &plan, Tile &tile) {
             tile.depth[s] = tiny ? SMALLEST : huge ? LARGEST : float(depth);
         }
     }
-    int32_t bad = 0;
-    for (int s = 0; s < n; s++) bad |= int32_t(!(tile.depth[s] > 0.0f && tile.depth[s] <= LARGEST));
-    if (bad)
-        for (int s = 0; s < n; s++) {
-            if (tile.depth[s] > 0.0f && tile.depth[s] <= LARGEST) continue;
-            if (!plan.invalid->found.exchange(true)) plan.invalid->depth = tile.depth[s];
-            tile.depth[s] = 1.0f;
-        }
     for (int s = 0; s < n; s++) {
+        tile.depth[s] = tile.depth[s] > 0.0f && tile.depth[s] <= LARGEST ? tile.depth[s] : 1.0f;
         tile.w[s] = tile.depth[s] < 1.0f ? tile.depth[s] : 1.0f;
         tile.z[s] = tile.w[s] / tile.depth[s];
     }
 }
 
-// Directions G q / |G q|, and 0 where the vector is no longer than the rounding error of its terms.
+// Directions G q / |G q|, and 0 where the vector is no longer than the rounding error of its terms, or its square nearly
+// underflows.
 inline void ray_directions(const Call &call, const View &view, Tile &tile) {
     const int n = int(tile.count);
     const double y = call.y[tile.j];
@@ -79,8 +73,9 @@ inline void ray_directions(const Call &call, const View &view, Tile &tile) {
     for (int s = 0; s < n; s++) {
         const double w = call.depths ? tile.w[s] : 1.0;
         const double z = call.depths ? tile.z[s] : plane_z(call, tile, tile.k + (tile.along_z ? s : 0));
-        const float terms = 4.0f * 0x1p-23f * float(view.terms * w + view.terms_z * std::fabs(z));
-        least[s] = terms * terms;
+        const float error = 4.0f * 0x1p-23f * float(view.terms * w + view.terms_z * std::fabs(z));
+        const float shortest = error > SMALLEST_DEPTH ? error : SMALLEST_DEPTH;
+        least[s] = shortest * shortest;
     }
     for (int s = 0; s < n; s++) {
         const float squares = vector[0][s] * vector[0][s] + vector[1][s] * vector[1][s] + vector[2][s] * vector[2][s];

@@ -170,7 +170,7 @@ def _direction(lattice, view, site, n, CONFIG: tl.constexpr):
     z = _row(table + DIRECTION_FIELDS + 8, site, w, along, CONFIG)
     squares = x * x + y * y + z * z
     shortest = FOUR_EPS * (tl.load(table + TERMS) * w + tl.load(table + TERMS + 1) * tl.abs(along))
-    away = unmasked & (squares > shortest * shortest)
+    away = unmasked & (squares > tl.maximum(shortest * shortest, SMALLEST_DEPTH * SMALLEST_DEPTH))
     inverse = tl.where(away, tl.rsqrt(tl.where(away, squares, 1.0)), 0.0)
     return tl.where(away, x * inverse, 0.0), tl.where(away, y * inverse, 0.0), tl.where(away, z * inverse, 0.0), inverse
 

@@ -108,11 +108,15 @@ def unit_vectors(rows: Sequence[Tensor], terms: Tensor, view_mask: Tensor | None
     """Normalise vectors, three rows (B, V, *sites), to (B, V, 3, *sites); 0 with zero gradient at 0.
 
     `terms` broadcasts to (B, V, *sites): a bound on the terms that add up to the vector. A vector as short as their
-    rounding error has no direction: the site is the camera centre.
+    rounding error, or than `SMALLEST_DEPTH`, has no direction: the site is the camera centre.
     """
     vector = torch.stack(list(rows), 2)
+    shortest = (4.0 * torch.finfo(vector.dtype).eps * terms.to(vector.dtype)).clamp_min(SMALLEST_DEPTH)[:, :, None]
+    # Scaled, as the square or the derivative of a short vector's inverse length leaves float32.
+    factor = 1.0 / power_of_two_above(vector.detach().abs().amax(2, keepdim=True).clamp_min(SMALLEST_DEPTH))
+    vector, shortest = vector * factor, shortest * factor
     squares = vector.square().sum(2, keepdim=True)
-    away = squares > (4.0 * torch.finfo(vector.dtype).eps * terms.to(vector.dtype)).square()[:, :, None]
+    away = squares > shortest.square()
     unit = torch.where(away, vector * torch.where(away, squares, 1.0).rsqrt(), 0.0)
     return mask_views(unit, view_mask)
 
@@ -127,12 +131,7 @@ def lattice_directions(sites: Sites, dtype: torch.dtype) -> Tensor:
     flat = a[..., 0] * sites.x.abs().amax(0) + a[..., 1] * sites.y.abs().amax(0) + a[..., 3]
     z = z.detach().abs()
     terms = flat + a[..., 2] * z[..., None, None] if w is None else flat * w.detach() + a[..., 2] * z
-    terms = terms.clamp_min(SMALLEST_DEPTH / (4.0 * torch.finfo(dtype).eps))  # shorter vectors have no direction
-    rows = lattice_rows(matrix, sites, dtype)
-    if sites.per_site():  # vectors may be as short as w, whose square underflows
-        factor = 1.0 / power_of_two_above(torch.stack(rows).detach().abs().amax(0))
-        rows, terms = [row * factor for row in rows], terms * factor
-    return unit_vectors(rows, terms, sites.view_mask)
+    return unit_vectors(lattice_rows(matrix, sites, dtype), terms, sites.view_mask)
 
 
 def point_directions(

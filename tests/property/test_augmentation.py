@@ -99,3 +99,18 @@ def test_sweep_appends_plane_depth_and_pixel_rays():
     for k in range(2):
         torch.testing.assert_close(maps[0, 0, 2:, k, 1, 1], torch.tensor([0.0, 0.0, 1.0]))
         torch.testing.assert_close(maps[0, 0, 2:, k, 0, 0], corner)
+
+
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_the_direction_of_a_point_next_to_the_camera_has_a_finite_gradient(backend):
+    """At (0, 0, h) before a camera in the origin the sum of the direction's entries grows by 1 / h along x and y."""
+    h = 1e-15
+    views = CameraTensors(torch.eye(3)[None, None], torch.eye(4)[None, None], 4, 5)
+    points = torch.tensor([[[1.0, 1, 1], [-1, -1, -1], [0, 0, h], [0, 0, -h]]]).requires_grad_()
+    values, _ = functional.unproject_points(
+        torch.zeros(1, 1, 1, 4, 5), views, points, augment="direction", backend=backend
+    )
+    directions = values[0, 0, 1:, 2:]
+    torch.testing.assert_close(directions, torch.tensor([[0.0, 0.0], [0.0, 0.0], [1.0, -1.0]]))
+    (gradient,) = torch.autograd.grad(directions.sum(), points)
+    torch.testing.assert_close(gradient[0, 2:] * h, torch.tensor([[1.0, 1, 0], [1, 1, 0]]), rtol=1e-5, atol=1e-6)

@@ -114,9 +114,9 @@ FAULTS = {
         "1.0f",
     ),
     "sites outside with geometric channels passed over": ("if ($appended == 0$ && misses_volume", "true"),
-    "gradient not cleared": ("if ($!call.source_gradient || call.accumulate$) return;", "true"),
+    "gradient not cleared": ("if ($call.accumulate$) return sums;", "true"),
     "bfloat16 cut off": ("$(bits + 0x7fff + (bits >> 16 & 1)) >> 16$;", "bits >> 16"),
-    "float16 denormals lost": ("magnitude < (113u << 23) ? $small$ : normal", "0u"),
+    "float16 denormals lost": ("magnitude < (113u << 23) ? $small$ : normal", "Bits<W>{}"),
 }
 
 NONE = 0

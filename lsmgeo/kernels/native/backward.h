@@ -139,16 +139,6 @@ inline void load_extra_gradients(const Call &call, const Tile &tile, int s, cons
     }
 }
 
-inline void clear_source_gradient(const Call &call, int64_t scene, int64_t view, int64_t channel, int64_t channels) {
-    if (!call.source_gradient || call.accumulate) return;
-    float *first = gradient_pointer(call, scene, view) + channel;
-    const int64_t *stride = call.source_gradient_stride;
-    for (int64_t z = 0; z < call.size[2]; z++)
-        for (int64_t y = 0; y < call.size[1]; y++)
-            for (int64_t x = 0; x < call.size[0]; x++)
-                std::memset(first + z * stride[2] + y * stride[3] + x * stride[4], 0, size_t(channels) * sizeof(float));
-}
-
 // Adds the gradients to a view's matrices M and G and to z, or writes those to its pixels.
 inline void store_geometry_gradients(const Plan &plan, const Tile &tile, int64_t chunk, const SiteGradients &site) {
     const Call &call = *plan.call;
@@ -209,23 +199,19 @@ inline bool needs_index_gradient(const Call &call) {
 
 // Backward of `sample`: all sites of one view, one chunk of the channels. The last also has the geometric channels.
 template <int DIMS, class S>
-void sample_backward(const Plan &plan, int64_t scene, int64_t view, int64_t chunk, Workspace &workspace) {
+void sample_backward(const Plan &plan, int64_t view, int64_t chunk, const Sums &sums, Workspace &workspace) {
     const Call &call = *plan.call;
     Tile &tile = *static_cast<Tile *>(workspace.tiles);
-    int64_t axes[3], to_axes[3];
+    int64_t axes[3];
     axis_strides(call.source_stride, axes);
-    axis_strides(call.source_gradient_stride, to_axes);
-    const int64_t channel = chunk * call.channels / call.chunks;
-    const int64_t channels = (chunk + 1) * call.channels / call.chunks - channel;
+    const int64_t scene = sums.scene, channel = sums.channel, channels = sums.channels;
     const int64_t appended = plan.channels - plan.features;
     const bool has_extra = chunk + 1 == call.chunks && appended > 0;
     const bool needs_index = needs_index_gradient(call);
     // Where correlations may saturate, and then have no gradient, they are computed again.
     const bool can_saturate = call.groups && call.gradient_type != FLOAT32;
     const S *source = source_pointer<S>(call, scene, view) + channel;
-    float *to = call.source_gradient ? gradient_pointer(call, scene, view) + channel : nullptr;
     SiteGradients site_gradients = {};
-    if (DIMS == 2) clear_source_gradient(call, scene, view, channel, channels);
     for (int64_t number = 0; number < plan.tiles; number++) {
         start_tile(plan, tile, scene, view, number);
         if (appended == 0 && misses_volume(call, view_of(plan, tile), tile)) continue;
@@ -261,8 +247,8 @@ void sample_backward(const Plan &plan, int64_t scene, int64_t view, int64_t chun
                                        reference_gradient(call, tile, s, channel), true);
                 }
                 if (call.groups == 1 && !needs_index) {
-                    if (to)
-                        scatter<DIMS>(call, tile, s, to, to_axes, channels, factor + channel,
+                    if (sums.first)
+                        scatter<DIMS>(call, tile, s, sums.first, sums.axes, channels, factor + channel,
                                       gradient[0] * float(call.share));
                     continue;
                 }
@@ -271,7 +257,7 @@ void sample_backward(const Plan &plan, int64_t scene, int64_t view, int64_t chun
             }
             if (needs_index)
                 index_gradient<DIMS>(call, tile, s, source, axes, channels, gradient, site_gradients.grad_index);
-            if (to) scatter<DIMS>(call, tile, s, to, to_axes, channels, gradient);
+            if (sums.first) scatter<DIMS>(call, tile, s, sums.first, sums.axes, channels, gradient);
         }
         if (has_extra) {
             const Block last = load_gradient(call, tile, plan.features, appended, workspace.values);
@@ -334,25 +320,20 @@ inline void statistics_backward(const Call &call, const float *values, int64_t c
 
 // Backward of `reduce`: all sites of one scene, one chunk of the channels.
 template <class S>
-void reduce_backward(const Plan &plan, int64_t scene, int64_t chunk, Workspace &workspace) {
+void reduce_backward(const Plan &plan, int64_t chunk, const Sums &sums, Workspace &workspace) {
     const Call &call = *plan.call;
     Tile *tiles = static_cast<Tile *>(workspace.tiles);
     SiteGradients *site_gradients = static_cast<SiteGradients *>(workspace.site_gradients);
-    int64_t axes[3], to_axes[3];
+    int64_t axes[3];
     axis_strides(call.source_stride, axes);
-    axis_strides(call.source_gradient_stride, to_axes);
-    const int64_t channel = chunk * call.channels / call.chunks;
-    const int64_t channels = (chunk + 1) * call.channels / call.chunks - channel;
+    const int64_t scene = sums.scene, channel = sums.channel, channels = sums.channels;
     const int64_t appended = chunk + 1 == call.chunks ? plan.channels - plan.features : 0;
     // Of the values: those of this chunk, or all correlations.
     const int64_t features = call.groups ? plan.features : channels, width = features + appended;
     const bool needs_index = needs_index_gradient(call);
     const bool only_mean = call.statistics == 1 && call.statistic[0] == MEAN;
     const bool is_linear = only_mean && appended == 0 && (!call.groups || call.gradient_type == FLOAT32);
-    for (int64_t v = 0; v < call.views; v++) {
-        clear_source_gradient(call, scene, v, channel, channels);
-        site_gradients[v] = SiteGradients{};
-    }
+    for (int64_t v = 0; v < call.views; v++) site_gradients[v] = SiteGradients{};
     for (int64_t number = 0; number < plan.tiles; number++) {
         for (int64_t v = 0; v < call.views; v++) {
             start_tile(plan, tiles[v], scene, v, number);
@@ -396,9 +377,8 @@ void reduce_backward(const Plan &plan, int64_t scene, int64_t chunk, Workspace &
                     if (needs_index)
                         index_gradient<2>(call, tiles[v], s, source, axes, channels, gradient,
                                           site_gradients[v].grad_index);
-                    if (call.source_gradient)
-                        scatter<2>(call, tiles[v], s, gradient_pointer(call, scene, v) + channel, to_axes, channels,
-                                   gradient, share);
+                    if (sums.first)
+                        scatter<2>(call, tiles[v], s, sums.first + v * sums.view, sums.axes, channels, gradient, share);
                     if (to_reference)
                         gather<2>(call, tiles[v], s, source, axes, channels, workspace.sampled, 1.0f, number > 0);
                 }
@@ -436,9 +416,8 @@ void reduce_backward(const Plan &plan, int64_t scene, int64_t chunk, Workspace &
                     index_gradient<2>(call, tiles[v], s, source, axes, channels, gradient,
                                       site_gradients[v].grad_index);
                 }
-                if (!call.source_gradient) continue;
-                float *to = gradient_pointer(call, scene, v) + channel;
-                scatter<2>(call, tiles[v], s, to, to_axes, channels, gradient);
+                if (!sums.first) continue;
+                scatter<2>(call, tiles[v], s, sums.first + v * sums.view, sums.axes, channels, gradient);
             }
         }
         for (int64_t v = 0; v < call.views; v++) store_geometry_gradients(plan, tiles[v], chunk, site_gradients[v]);

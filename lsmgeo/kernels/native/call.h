@@ -21,6 +21,9 @@ struct Call {
 
     const void *source;
     int64_t source_type, source_stride[5];
+    const void *original;          // where its channels are not adjacent: `source` is memory for a copy; or null
+    int64_t original_stride[6];    // scene, view, channel, z, y, x
+    uint8_t *ready;                // zeros: of the copy's segments of 32 pixels, (B, V or 1, z, y, segments of x)
     const double *matrix, *direction_matrix;  // (B, V, 3, 4), or null
     const double *x, *y, *z;
     int64_t z_stride[3];           // scene, view, plane
@@ -42,7 +45,8 @@ struct Call {
     int64_t gradient_type, gradient_stride[6];
     int64_t chunks, accumulate;    // parts of the channels; whether the source's gradient is added to what is there
     int64_t whole_scenes;          // whether one task has all views of a scene, as their gradients meet in memory
-    float *source_gradient;
+    void *source_gradient;         // of the source's type, or float32
+    int64_t source_gradient_type;
     int64_t source_gradient_stride[5];
     double *matrix_gradient, *direction_gradient;  // (B, V, chunks, 3, 4), or null
     double *z_gradient;            // (B, V, chunks, D), or null

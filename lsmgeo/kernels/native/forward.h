@@ -14,14 +14,19 @@ template <class S>
 inline void store_block(S *values, const Layout &at, int64_t sites, int64_t channels, const float *block) {
     S *first = values + at.base;
     if (at.channel == 1) {
-        for (int64_t s = 0; s < sites; s++)
-            for (int64_t c = 0; c < channels; c++) store(first + s * at.site + c, block[s * channels + c]);
-    } else if (at.site == 1) {
-        for (int64_t c = 0; c < channels; c++)
-            for (int64_t s = 0; s < sites; s++) store(first + c * at.channel + s, block[s * channels + c]);
-    } else {
-        for (int64_t s = 0; s < sites; s++)
-            for (int64_t c = 0; c < channels; c++) store(first + s * at.site + c * at.channel, block[s * channels + c]);
+        for (int64_t s = 0; s < sites; s++) convert_row(block + s * channels, channels, first + s * at.site);
+        return;
+    }
+    for (int64_t c = 0; c < channels; c += LANES) {
+        float rows[LANES][TILE];
+        const int64_t count = std::min<int64_t>(LANES, channels - c);
+        transpose(block + c, channels, rows[0], TILE, sites, count);
+        for (int64_t r = 0; r < count; r++) {
+            S *to = first + (c + r) * at.channel;
+            if (at.site == 1) convert_row(rows[r], sites, to);
+            else
+                for (int64_t s = 0; s < sites; s++) convert_row(rows[r] + s, 1, to + s * at.site);
+        }
     }
 }
 
@@ -37,12 +42,21 @@ inline void store_tile(const Call &call, const Layout &at, int64_t sites, int64_
 template <class S>
 inline void load_block(const S *values, const Layout &at, int64_t sites, int64_t channels, float *block) {
     const S *first = values + at.base;
-    if (at.channel == 1)
-        for (int64_t s = 0; s < sites; s++)
-            for (int64_t c = 0; c < channels; c++) block[s * channels + c] = to_float(first[s * at.site + c]);
-    else
-        for (int64_t c = 0; c < channels; c++)
-            for (int64_t s = 0; s < sites; s++) block[s * channels + c] = to_float(first[s * at.site + c * at.channel]);
+    if (at.channel == 1) {
+        for (int64_t s = 0; s < sites; s++) convert_row(first + s * at.site, channels, block + s * channels);
+        return;
+    }
+    for (int64_t c = 0; c < channels; c += LANES) {
+        float rows[LANES][TILE];
+        const int64_t count = std::min<int64_t>(LANES, channels - c);
+        for (int64_t r = 0; r < count; r++) {
+            const S *from = first + (c + r) * at.channel;
+            if (at.site == 1) convert_row(from, sites, rows[r]);
+            else
+                for (int64_t s = 0; s < sites; s++) rows[r][s] = to_float(from[s * at.site]);
+        }
+        transpose(rows[0], TILE, block + c, channels, count, sites);
+    }
 }
 
 // Channels at the sites of a tile: (sites, channels), `step` floats from site to site; not copied where possible.
@@ -118,21 +132,6 @@ inline void start_tile(const Plan &plan, Tile &tile, int64_t scene, int64_t view
     if (call.depths) load_depths(plan, tile);
 }
 
-template <class S>
-inline const S *source_pointer(const Call &call, int64_t scene, int64_t view) {
-    return static_cast<const S *>(call.source) + scene * call.source_stride[0] + view * call.source_stride[1];
-}
-
-inline float *gradient_pointer(const Call &call, int64_t scene, int64_t view) {
-    return call.source_gradient + scene * call.source_gradient_stride[0] + view * call.source_gradient_stride[1];
-}
-
-inline void axis_strides(const int64_t *stride, int64_t *axes) {  // to the order x, y, z
-    axes[0] = stride[4];
-    axes[1] = stride[3];
-    axes[2] = stride[2];
-}
-
 // Whether a tile of a sweep reads nothing, judged by its two ends: indices are monotonic along a tile. Much of a sweep
 // lies outside the volume. A wrong "no" costs only time; the margin exceeds rounding errors.
 inline bool misses_volume(const Call &call, const View &view, const Tile &tile) {
@@ -180,11 +179,6 @@ inline void store_zeros(const Call &call, Tile &tile, const Layout &at, int64_t 
         for (int64_t s = 0; s < tile.count; s++)
             for (int64_t c = 0; c < channels; c++) out[s * at.site + c * at.channel] = 0.0f;
     }
-}
-
-template <int W> INLINE Floats<W> clamped_lanes(Floats<W> values, float largest) {
-    const Floats<W> below = values > largest ? Floats<W>{} + largest : values;
-    return below < -largest ? Floats<W>{} - largest : below;
 }
 
 // Means, or sums, over groups of channels of reference times sample, one for each group. Products saturate.

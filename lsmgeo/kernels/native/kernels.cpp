@@ -63,6 +63,7 @@ struct Workspace {
     void *tiles, *site_gradients;
     float *values, *reduced, *value_gradients, *zeros;
     float *reference, *sampled, *row;  // of a tile; of one site: the source's channels, and their gradient
+    float *sums;                       // of gradients to be rounded
     int64_t *visible_views;
 };
 
@@ -74,7 +75,7 @@ namespace baseline {
 // LSMGEO_ONE_SET builds only the first, in a fraction of the time.
 #if VARIANTS
 #pragma GCC push_options
-#pragma GCC target("avx2,fma,bmi2")
+#pragma GCC target("avx2,fma,bmi2,f16c")
 #undef LANES
 #define LANES 8
 namespace avx2 {
@@ -82,7 +83,7 @@ namespace avx2 {
 }
 #pragma GCC pop_options
 #pragma GCC push_options
-#pragma GCC target("avx512f,avx512bw,avx512dq,avx512vl,avx2,fma,bmi2,prefer-vector-width=512")
+#pragma GCC target("avx512f,avx512bw,avx512dq,avx512vl,avx2,fma,bmi2,f16c,prefer-vector-width=512")
 #undef LANES
 #define LANES 16
 namespace avx512 {
@@ -100,7 +101,7 @@ std::vector<InstructionSet> available() {
 #if VARIANTS
     __builtin_cpu_init();
     const bool has_avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
-                          __builtin_cpu_supports("bmi2");
+                          __builtin_cpu_supports("bmi2") && __builtin_cpu_supports("f16c");
     if (has_avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
         __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
         sets.push_back({"avx512", avx512::run_task, avx512::tile_sizes()});
@@ -212,7 +213,12 @@ int run(const Call &call, bool backward) {
     const int64_t of_reference = call.groups ? call.channels : 0;
     const int64_t floats = 2 * value_floats + statistics * chosen.sizes.length * plan.channels + plan.channels +
                            (chosen.sizes.length + 2) * of_reference;
-    const int64_t bytes = tiles * (chosen.sizes.tile + chosen.sizes.site_gradients) + 4 * floats + 8 * call.views + 512;
+    int64_t sums = 0;
+    if (backward && call.source_gradient && call.source_gradient_type != FLOAT32)
+        sums = (call.statistics ? call.views : 1) * call.size[0] * call.size[1] * call.size[2] *
+               ((call.channels + call.chunks - 1) / call.chunks);
+    const int64_t bytes = tiles * (chosen.sizes.tile + chosen.sizes.site_gradients) + 4 * (floats + sums) +
+                          8 * call.views + 512;
     // Each thread starts with its own part and then helps the others: two threads next to each other would fault in,
     // and clear, the same fresh pages.
     const int64_t threads = std::max<int64_t>(1, std::min(call.threads, tasks));
@@ -241,6 +247,7 @@ int run(const Call &call, bool backward) {
         workspace.reference = reinterpret_cast<float *>(reserve(4 * chosen.sizes.length * of_reference));
         workspace.sampled = reinterpret_cast<float *>(reserve(4 * of_reference));
         workspace.row = reinterpret_cast<float *>(reserve(4 * of_reference));
+        workspace.sums = reinterpret_cast<float *>(reserve(4 * sums));
         std::fill(workspace.zeros, workspace.zeros + plan.channels, 0.0f);
         const int64_t own = arrived++;
         for (int64_t offset = 0; offset < threads; offset++) {

@@ -22,6 +22,7 @@ TYPES = {torch.float32: 0, torch.bfloat16: 1, torch.float16: 2, torch.float64: 3
 SOURCE_TYPES = (torch.float32, torch.bfloat16, torch.float16)
 STATISTICS = {"mean": 0, "variance": 1, "max": 2}
 LEAST_CHUNK = 8  # channels of a task
+SEGMENT = 32  # pixels of native/sources.h
 
 
 def why_not(operator: str, source: Tensor, options: Options) -> str | None:
@@ -46,13 +47,10 @@ def channels_last(source: Tensor, axis: int) -> Tensor:
 def _new_call(kind: int, source: Tensor, options: Options, sites: Sequence[int]) -> Call:
     call = Call()
     call.kind, call.threads = kind, torch.get_num_threads()
-    strides = source.stride()
     if kind == PLANE_SWEEP_PROJECT:
         call.scenes, call.channels, *sizes = source.shape
-        call.source_stride[:] = (strides[0], 0, *strides[2:])
     else:
         call.scenes, call.views, call.channels, *sizes = source.shape
-        call.source_stride[:] = (*strides[:2], 0, *strides[3:])
     call.size[:] = (*reversed(sizes), 1)[:3]
     call.sites[:] = sites
     call.nearest = options.mode == "nearest"
@@ -62,7 +60,29 @@ def _new_call(kind: int, source: Tensor, options: Options, sites: Sequence[int])
         call.statistic[number] = STATISTICS[name]
     call.near = options.near
     call.source, call.source_type = source.data_ptr(), TYPES[source.dtype]
+    call.source_stride[:] = _source_strides(source, _channel_axis(kind))
     return call
+
+
+def _source_strides(source: Tensor, axis: int) -> tuple[int, ...]:
+    """Those of scene, view, z, y and x; 0 for the view of a volume and the z of an image."""
+    scene, *views = source.stride()[:axis]
+    depth, *sides = source.stride()[axis + 1 :] if axis == 1 else (0, *source.stride()[axis + 1 :])
+    return scene, *(views or [0]), depth, *sides
+
+
+def _set_copy(call: Call, source: Tensor, axis: int) -> tuple[Tensor, ...]:
+    """Set memory for a copy with adjacent channels, where they are not; the kernel fills what it reads."""
+    if source.shape[axis] < 2 or source.stride(axis) == 1:
+        return ()
+    copy = empty(source.shape, source.dtype, [*(other for other in range(source.dim()) if other != axis), axis])
+    segments = -(-call.size[0] // SEGMENT)
+    ready = torch.zeros((*source.shape[:axis], *call.size[2:0:-1], segments), dtype=torch.uint8, device="cpu")
+    scene, view, *sides = call.source_stride
+    call.original, call.original_stride[:] = source.data_ptr(), (scene, view, source.stride(axis), *sides)
+    call.source, call.ready = copy.data_ptr(), ready.data_ptr()
+    call.source_stride[:] = _source_strides(copy, axis)
+    return copy, ready
 
 
 def _set_sites(call: Call, sites: Sites, options: Options) -> tuple[Tensor | None, ...]:
@@ -96,19 +116,19 @@ def _set_gradient(call: Call, gradient: Tensor, options: Options) -> None:
 
 
 def _set_source_gradient(call: Call, source: Tensor, axis: int, into: Tensor | None) -> Tensor:
-    """Set the memory of the source's gradient, float32: `into`, to add to, or new memory that the kernel clears."""
+    """Set the memory of the source's gradient: `into`, float32, to add to, or new memory that the kernel fills."""
     if into is None:
         order = [other for other in range(source.dim()) if other != axis]
-        gradient = empty(source.shape, torch.float32, [*order, axis])
-        if 0 in call.sites[:]:  # then no task runs that would clear it
+        gradient = empty(source.shape, source.dtype, [*order, axis])
+        if 0 in call.sites[:]:  # then no task runs that would fill it
             gradient.zero_()
     elif into.shape[axis] > 1 and into.stride(axis) != 1:
         raise ValueError("the channels of a gradient to add to must be adjacent")
     else:
         gradient = into
-    strides = gradient.stride()
     call.accumulate, call.source_gradient = into is not None, gradient.data_ptr()
-    call.source_gradient_stride[:] = (strides[0], 0, *strides[2:]) if axis == 1 else (*strides[:2], 0, *strides[3:])
+    call.source_gradient_type = TYPES[gradient.dtype]
+    call.source_gradient_stride[:] = _source_strides(gradient, axis)
     return gradient
 
 
@@ -158,11 +178,18 @@ def _set_reference_gradient(call: Call, reference: Tensor) -> Tensor:
     return gradient
 
 
-def _lattice_call(kind: int, source: Tensor, sites: Sites, options: Options) -> tuple[Call, tuple[Tensor | None, ...]]:
+def _lattice_call(
+    kind: int, source: Tensor, sites: Sites, options: Options, reads_source: bool = True
+) -> tuple[Call, tuple[Tensor | None, ...]]:
     """A call on the sites of a lattice, and what must live as long as it."""
-    source = channels_last(source, _channel_axis(kind))
     call = _new_call(kind, source, options, sites.counts()[::-1])
-    return call, (source, *_set_sites(call, sites, options))
+    copy = _set_copy(call, source, _channel_axis(kind)) if reads_source else ()
+    return call, (*copy, *_set_sites(call, sites, options))
+
+
+def _is_linear(options: Options, appended: bool) -> bool:
+    """Whether the values' gradient to the source can be found without reading it."""
+    return not options.reduce or (tuple(options.reduce) == ("mean",) and not appended)
 
 
 def _channel_axis(kind: int) -> int:
@@ -181,8 +208,11 @@ def _lattice_backward(
     share: float | None = None,
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None, Tensor | None, Tensor | None]:
     """Gradients to source, matrix, direction, z and reference."""
-    call, alive = _lattice_call(kind, source, sites, options)
     of_source, of_matrix, of_direction, of_z, of_reference = needs
+    can_saturate = reference is not None and gradient.dtype != torch.float32
+    is_linear = _is_linear(options, bool(options.depth or options.direction)) and not can_saturate
+    reads = of_matrix or of_z or of_reference or not is_linear
+    call, alive = _lattice_call(kind, source, sites, options, reads)
     # One task has all views of a scene where their gradients are added to one array.
     shares_depths = of_z and sites.per_site() and sites.z.shape[1] < call.views
     call.whole_scenes = kind == PLANE_SWEEP_PROJECT or of_reference or shares_depths
@@ -195,8 +225,6 @@ def _lattice_backward(
     parts = _set_geometry_gradients(call, sites, (of_matrix, of_direction and bool(options.direction), of_z))
     run(call, backward=True)
     del alive
-    if to_source is not None and into is None:
-        to_source = saturating_cast(to_source, source.dtype)
     if to_reference is not None:
         to_reference = saturating_cast(to_reference, reference.dtype)  # type: ignore[union-attr]
     return to_source, *(None if part is None else part.sum(2) for part in parts), to_reference  # type: ignore[return-value]
@@ -260,21 +288,21 @@ def sample_views(
     source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options
 ) -> tuple[Tensor, Tensor]:
     """Sample images (B, V, C, h, w) at pixels (B, V, N, 2) where `front` (B, V, N), append `extra` (B, V, E, N)."""
-    source = channels_last(source, 2)
     values, visible = _forward(*_pixels_call(source, pixels, front, extra, options), source.dtype, options)
     return values[..., 0, 0, :], visible[:, :, 0, 0]
 
 
 def _pixels_call(
-    source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options
+    source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options, reads_source: bool = True
 ) -> tuple[Call, tuple[Tensor | None, ...]]:
     call = _new_call(SAMPLE_VIEWS, source, options, (front.shape[-1], 1, 1))
+    copy = _set_copy(call, source, 2) if reads_source else ()
     pixels, front = pixels.float().contiguous(), front.contiguous()
     extras = None if extra is None else extra.float().movedim(2, 3).contiguous()
     call.pixels, call.front = pixels.data_ptr(), front.data_ptr()
     call.extra = 0 if extras is None else extras.shape[3]
     call.extras = None if extras is None else extras.data_ptr()
-    return call, (pixels, front, extras)
+    return call, (*copy, pixels, front, extras)
 
 
 def sample_views_backward(
@@ -287,8 +315,8 @@ def sample_views_backward(
     needs: Sequence[bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
     """Vector-Jacobian product of `sample_views` to source, pixels and extra, each in its dtype."""
-    original, source = source, channels_last(source, 2)
-    call, alive = _pixels_call(source, pixels, front, extra, options)
+    reads = needs[1] or not _is_linear(options, extra is not None)
+    call, alive = _pixels_call(source, pixels, front, extra, options, reads)
     _set_gradient(call, gradient[..., None, None, :], options)
     to_source = _set_source_gradient(call, source, 2, None) if needs[0] else None
     to_pixels = torch.zeros((call.chunks, *pixels.shape), dtype=torch.float32, device="cpu") if needs[1] else None
@@ -300,7 +328,7 @@ def sample_views_backward(
     run(call, backward=True)
     del alive
     return (
-        None if to_source is None else saturating_cast(to_source, original.dtype),
+        to_source,
         None if to_pixels is None else to_pixels.sum(0).to(pixels.dtype),
         None if to_extra is None else to_extra.movedim(3, 2).to(extra.dtype),  # type: ignore[union-attr]
     )

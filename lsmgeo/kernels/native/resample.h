@@ -7,6 +7,8 @@
 
 #include "sampling.h"
 
+#include "sources.h"
+
 #include "forward.h"
 
 #include "backward.h"
@@ -25,16 +27,27 @@ void task(const Plan &plan, int64_t number, Workspace &workspace) {
         return;
     }
     const int64_t chunk = number % call.chunks, rest = number / call.chunks;
+    const int64_t channel = chunk * call.channels / call.chunks;
+    const int64_t channels = (chunk + 1) * call.channels / call.chunks - channel;
+    auto with_sums = [&](int64_t scene, int64_t start, int64_t views, auto body) {
+        const Sums sums = start_sums(call, scene, start, views, channel, channels, workspace);
+        body(sums);
+        finish_sums(call, sums);
+    };
+    auto one_view = [&](int64_t scene, int64_t v) {
+        with_sums(scene, v, 1, [&](const Sums &sums) { sample_backward<2, S>(plan, v, chunk, sums, workspace); });
+    };
     if (call.statistics) {
-        reduce_backward<S>(plan, rest, chunk, workspace);
+        with_sums(rest, 0, call.views,
+                  [&](const Sums &sums) { reduce_backward<S>(plan, chunk, sums, workspace); });
     } else if (call.kind == PLANE_SWEEP_PROJECT) {  // the views of a scene share its volume
-        const int64_t channel = chunk * call.channels / call.chunks;
-        clear_source_gradient(call, rest, 0, channel, (chunk + 1) * call.channels / call.chunks - channel);
-        for (int64_t v = 0; v < call.views; v++) sample_backward<3, S>(plan, rest, v, chunk, workspace);
+        with_sums(rest, 0, 1, [&](const Sums &sums) {
+            for (int64_t v = 0; v < call.views; v++) sample_backward<3, S>(plan, v, chunk, sums, workspace);
+        });
     } else if (call.whole_scenes) {
-        for (int64_t v = 0; v < call.views; v++) sample_backward<2, S>(plan, rest, v, chunk, workspace);
+        for (int64_t v = 0; v < call.views; v++) one_view(rest, v);
     } else {
-        sample_backward<2, S>(plan, rest / call.views, rest % call.views, chunk, workspace);
+        one_view(rest / call.views, rest % call.views);
     }
 }
 

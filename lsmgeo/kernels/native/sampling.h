@@ -216,18 +216,6 @@ inline void interpolation_weights(const Call &call, Tile &tile) {
     }
 }
 
-template <int DIMS>
-inline void locate(const Call &call, const View &view, Tile &tile) {
-    if (call.kind != SAMPLE_VIEWS)
-        for (int s = 0; s < int(tile.count); s++) tile.x[s] = float(call.x[tile.i + (tile.along_z ? 0 : s)]);
-    if (DIMS == 3) project_to_voxels(call, view, tile);
-    else if (call.kind == SAMPLE_VIEWS) load_pixels(call, tile);
-    else if (call.depths) project_depths_to_pixels(call, view, tile);
-    else project_to_pixels(call, view, tile);
-    if (call.direction) ray_directions(call, view, tile);
-    interpolation_weights<DIMS>(call, tile);
-}
-
 // Taps: the cells that a site reads. Almost all sites have 2^DIMS of them inside the source, which is the fast case,
 // or one in nearest sampling. At the source's edge each tap is tested.
 

@@ -14,15 +14,6 @@ struct Float16 { uint16_t bits; };
 inline float from_bits(uint32_t bits) { float value; std::memcpy(&value, &bits, 4); return value; }
 inline uint32_t to_bits(float value) { uint32_t bits; std::memcpy(&bits, &value, 4); return bits; }
 
-inline float to_float(float value) { return value; }
-inline float to_float(Bfloat16 value) { return from_bits(uint32_t(value.bits) << 16); }
-inline float to_float(Float16 value) {
-    const uint32_t magnitude = uint32_t(value.bits & 0x7fff) << 13;
-    const uint32_t finite = to_bits(from_bits(magnitude) * 0x1p112f);
-    const uint32_t special = (value.bits & 0x7c00) == 0x7c00 ? 0x7f800000u : 0u;
-    return from_bits(finite | special | uint32_t(value.bits & 0x8000) << 16);
-}
-
 inline float clamped(float value, float largest) {
     return value > largest ? largest : value < -largest ? -largest : value;
 }
@@ -30,22 +21,6 @@ inline float clamped(float value, float largest) {
 // Above this an output saturates and has no gradient, as in `lsmgeo._dtypes.saturation_limit`.
 inline float saturation_limit(int64_t type) {
     return type == FLOAT32 ? LARGEST : type == BFLOAT16 ? 0x1.fe7f8p127f : 0x1.ffcffep15f;
-}
-
-// Finite numbers stay finite: those beyond the type's largest number become that number.
-inline void store(float *place, float value) { *place = value; }
-inline void store(Bfloat16 *place, float value) {
-    const uint32_t bits = to_bits(clamped(value, 0x1.fep127f));
-    const uint32_t rounded = (bits + 0x7fff + (bits >> 16 & 1)) >> 16;
-    place->bits = uint16_t(value == value ? rounded : 0x7fc0);
-}
-inline void store(Float16 *place, float value) {
-    const uint32_t bits = to_bits(clamped(value, 65504.0f));
-    const uint32_t magnitude = bits & 0x7fffffff;
-    const uint32_t normal = (magnitude + 0xfff + (magnitude >> 13 & 1) - (112u << 23)) >> 13;
-    const uint32_t small = to_bits(from_bits(magnitude) + 0.5f) - to_bits(0.5f);  // adding rounds to units of 2^-24
-    const uint32_t rounded = (magnitude < (113u << 23) ? small : normal) | (bits >> 16 & 0x8000);
-    place->bits = uint16_t(value == value ? rounded : 0x7e00);
 }
 
 // Vectors of W floats. The compiler splits them into registers of the instruction set; arithmetic is lane by lane.
@@ -72,12 +47,63 @@ template <int W> INLINE Bits<W> load_halves(const uint16_t *place) {
 }
 template <int W> INLINE Floats<W> load(const Bfloat16 *place) { return Floats<W>(load_halves<W>(&place->bits) << 16); }
 template <int W> INLINE Floats<W> load(const Float16 *place) {
+#if LANES > 4
+    if constexpr (W == 4) return Floats<4>(_mm_cvtph_ps(_mm_loadl_epi64(reinterpret_cast<const __m128i *>(place))));
+    if constexpr (W == 8) return Floats<8>(_mm256_cvtph_ps(_mm_loadu_si128(reinterpret_cast<const __m128i *>(place))));
+#endif
+#if LANES == 16
+    if constexpr (W == 16)
+        return Floats<16>(_mm512_cvtph_ps(_mm256_loadu_si256(reinterpret_cast<const __m256i *>(place))));
+#endif
     const Bits<W> bits = load_halves<W>(&place->bits);
     const Bits<W> finite = Bits<W>(Floats<W>((bits & 0x7fff) << 13) * 0x1p112f);
     const Bits<W> special = Bits<W>((bits & 0x7c00) == 0x7c00) & 0x7f800000u;
     return Floats<W>(finite | special | (bits & 0x8000) << 16);
 }
+template <class S> INLINE float to_float(const S &value) { return load<1>(&value)[0]; }
+
+template <int W> INLINE Floats<W> clamped_lanes(Floats<W> values, float largest) {
+    const Floats<W> below = values > largest ? Floats<W>{} + largest : values;
+    return below < -largest ? Floats<W>{} - largest : below;
+}
+
+// Numbers are rounded to the nearest, of two to the even one. Finite ones stay finite: those beyond the type's largest
+// number become that number.
 template <int W> INLINE void store(float *place, Floats<W> values) { std::memcpy(place, &values, sizeof values); }
+template <int W> INLINE void store_halves(uint16_t *place, Bits<W> bits) {
+    const auto halves = __builtin_convertvector(bits, typename Vector<W>::Halves);
+    std::memcpy(place, &halves, sizeof halves);
+}
+template <int W> INLINE void store(Bfloat16 *place, Floats<W> values) {
+    const Bits<W> bits = Bits<W>(clamped_lanes<W>(values, 0x1.fep127f));
+    const Bits<W> rounded = (bits + 0x7fff + (bits >> 16 & 1)) >> 16;
+    store_halves<W>(&place->bits, values == values ? rounded : Bits<W>{} + 0x7fc0);
+}
+template <int W> INLINE void store(Float16 *place, Floats<W> values) {
+    const Floats<W> held = clamped_lanes<W>(values, 65504.0f);
+#if LANES > 4
+    if constexpr (W == 4) {
+        _mm_storel_epi64(reinterpret_cast<__m128i *>(place), _mm_cvtps_ph(__m128(held), _MM_FROUND_TO_NEAREST_INT));
+        return;
+    }
+    if constexpr (W == 8) {
+        _mm_storeu_si128(reinterpret_cast<__m128i *>(place), _mm256_cvtps_ph(__m256(held), _MM_FROUND_TO_NEAREST_INT));
+        return;
+    }
+#endif
+#if LANES == 16
+    if constexpr (W == 16) {
+        _mm256_storeu_si256(reinterpret_cast<__m256i *>(place),
+                            _mm512_cvtps_ph(__m512(held), _MM_FROUND_TO_NEAREST_INT));
+        return;
+    }
+#endif
+    const Bits<W> bits = Bits<W>(held), magnitude = bits & 0x7fffffff;
+    const Bits<W> normal = (magnitude + 0xfff + (magnitude >> 13 & 1) - (112u << 23)) >> 13;
+    const Bits<W> small = Bits<W>(Floats<W>(magnitude) + 0.5f) - to_bits(0.5f);  // rounds to units of 2^-24
+    const Bits<W> rounded = (magnitude < (113u << 23) ? small : normal) | (bits >> 16 & 0x8000);
+    store_halves<W>(&place->bits, values == values ? rounded : Bits<W>{} + 0x7e00);
+}
 
 // The numbers at these offsets: the compiler does not use the gather instruction by itself.
 template <class S> INLINE Floats<LANES> gather_lanes(const S *first, const int32_t *offsets) {
@@ -103,15 +129,23 @@ template <class Body> INLINE void over_channels(int64_t channels, Body body) {
     for (; c < channels; c++) body(std::integral_constant<int, 1>(), c);
 }
 
+// Copies floats to or from numbers of any type.
+template <class From, class To> INLINE void convert_row(const From *from, int64_t count, To *to) {
+    over_channels(count, [&](auto width, int64_t c) INLINED {
+        constexpr int W = decltype(width)::value;
+        store<W>(to + c, load<W>(from + c));
+    });
+}
+
 // One step of transposing a square block: exchanges its off-diagonal squares of K by K.
-template <int K, int... I>
-INLINE void exchange_squares(Floats<LANES> &a, Floats<LANES> &b, std::integer_sequence<int, I...>) {
-    const Floats<LANES> first = __builtin_shufflevector(a, b, (I & K ? LANES + I - K : I)...);
+template <int K, class Row, int... I>
+INLINE void exchange_squares(Row &a, Row &b, std::integer_sequence<int, I...>) {
+    const Row first = __builtin_shufflevector(a, b, (I & K ? LANES + I - K : I)...);
     b = __builtin_shufflevector(a, b, (I & K ? LANES + I : I + K)...);
     a = first;
 }
 
-template <int K> INLINE void transpose_square(Floats<LANES> *rows) {
+template <int K, class Row> INLINE void transpose_square(Row *rows) {
     if constexpr (K > 0) {
         for (int row = 0; row < LANES; row++)
             if (!(row & K)) exchange_squares<K>(rows[row], rows[row + K], std::make_integer_sequence<int, LANES>());
@@ -119,16 +153,18 @@ template <int K> INLINE void transpose_square(Floats<LANES> *rows) {
     }
 }
 
-// to[column * to_step + row] = from[row * from_step + column]
-inline void transpose(const float *from, int64_t from_step, float *to, int64_t to_step, int64_t rows, int64_t columns) {
+// to[column * to_step + row] = from[row * from_step + column], of floats or of the bits of halves
+template <class T>
+inline void transpose(const T *from, int64_t from_step, T *to, int64_t to_step, int64_t rows, int64_t columns) {
+    typedef T Row __attribute__((vector_size(sizeof(T) * LANES)));
     int64_t row = 0;
     for (; row + LANES <= rows; row += LANES) {
         int64_t column = 0;
         for (; column + LANES <= columns; column += LANES) {
-            Floats<LANES> square[LANES];
-            for (int r = 0; r < LANES; r++) square[r] = load<LANES>(from + (row + r) * from_step + column);
+            Row square[LANES];
+            for (int r = 0; r < LANES; r++) std::memcpy(square + r, from + (row + r) * from_step + column, sizeof(Row));
             transpose_square<LANES / 2>(square);
-            for (int c = 0; c < LANES; c++) store<LANES>(to + (column + c) * to_step + row, square[c]);
+            for (int c = 0; c < LANES; c++) std::memcpy(to + (column + c) * to_step + row, square + c, sizeof(Row));
         }
         for (; column < columns; column++)
             for (int r = 0; r < LANES; r++) to[column * to_step + row + r] = from[(row + r) * from_step + column];

@@ -84,6 +84,7 @@ WIDE, WIDE_VOLUME = (
     torch.cat([(0.3 + 0.07 * number) * source for number in range(7)], axis)
     for source, axis in ((FEATURES, 2), (VOLUME, 1))
 )
+BROAD = torch.cat([(1.0 - 0.09 * number) * WIDE for number in range(8)], -1)  # rows that are copied in segments
 SWEEP = (VOLUME, VIEWS, GRID, DEPTHS, SIZE)
 SPLAT = (VIEWS, GRID, DEPTHS)
 MAPS, SHARES = _random(B, V, C, *SIZE), _random(B, V, 5, *SIZE)
@@ -152,6 +153,10 @@ CASES: dict[str, Callable[[str], None]] = {
         splat_call, PLANE_MAPS.movedim(3, -1).contiguous().movedim(-1, 3), *SPLAT, mode="nearest", padding_mode="border"
     ),
     "splat without weights, pixels' depths": _case(splat_call, PLANE_MAPS[:, :, :, :4], *SPLAT[:2], PIXEL_DEPTHS),
+    "broad": _case(unproject_call, BROAD, VIEWS, GRID),
+    "broad, columns adjacent": _case(
+        unproject_call, BROAD.mT.contiguous().mT, VIEWS, GRID, reduce="variance", padding_mode="border"
+    ),
     "contiguous": _case(
         unproject_call, WIDE, VIEWS, GRID, reduce=("mean", "variance"), memory_format=torch.contiguous_format
     ),
@@ -162,6 +167,8 @@ HALF: dict[str, Callable[[str], None]] = {
     for name, case in {
         "bilinear": _case(unproject_call, WIDE.to(dtype), VIEWS, GRID, **_both()),
         "statistics": _case(unproject_call, WIDE.to(dtype), VIEWS, GRID, reduce=("mean", "variance")),
+        "mean": _case(unproject_call, BROAD.to(dtype), VIEWS, GRID, reduce="mean"),
+        "contiguous": _case(unproject_call, WIDE.to(dtype), VIEWS, GRID, memory_format=torch.contiguous_format),
         "trilinear": _case(sweep_call, WIDE_VOLUME.to(dtype), *SWEEP[1:], flat=5, padding_mode="border", **_both()),
         "pixels": _case(views_call, WIDE.to(dtype), PIXELS, DISTANCE, VALID),
         "one channel": _case(unproject_call, FEATURES[:, :, :1].to(dtype), VIEWS, GRID, padding_mode="border"),

@@ -114,6 +114,13 @@ FAULTS = {
         "1.0f",
     ),
     "sites outside with geometric channels passed over": ("if ($appended == 0$ && misses_volume", "true"),
+    "segments of a copy forgotten": (
+        "last = $std::min<int64_t>(x + 1, call.size[0] - 1)$ / SEGMENT;",
+        "std::max(x, 0)",
+    ),
+    "rows of a copy forgotten": ("last_y = $std::min<int64_t>(y + 1, call.size[1] - 1)$;", "y"),
+    "segments of a copy from the row's start": ("y * from[4] + $first$ * from[5];", "0"),
+    "views' sums of gradients in one place": ("sums.view = $sums.axes[2] * size[2]$;", "0"),
     "gradient not cleared": ("if ($call.accumulate$) return sums;", "true"),
     "bfloat16 cut off": ("$(bits + 0x7fff + (bits >> 16 & 1)) >> 16$;", "bits >> 16"),
     "float16 denormals lost": ("magnitude < (113u << 23) ? $small$ : normal", "Bits<W>{}"),

@@ -228,6 +228,19 @@ void sample(const Plan &plan, int64_t scene, int64_t view, int64_t first, int64_
             if (!in_place) store_tile(call, at, tile.count, channels, workspace.values);
             continue;
         }
+        if constexpr (!std::is_same<S, float>::value) {
+            if (call.values_type == call.source_type && at.channel == 1 && channels == call.channels && !call.groups) {
+                for (int s = 0; s < int(tile.count); s++) {
+                    S *to = static_cast<S *>(call.values) + at.base + s * at.site;
+                    // At the edge a sum is not made in one go.
+                    const bool at_once = call.nearest || tile.interior[s] || !tile.in_range[s];
+                    if (at_once) gather<DIMS>(call, tile, s, source, axes, channels, to);
+                    else gather<DIMS>(call, tile, s, source, axes, channels, workspace.values);
+                    if (!at_once) convert_row(workspace.values, channels, to);
+                }
+                continue;
+            }
+        }
         Block reference = {};
         if (call.groups) reference = load_reference(call, tile, 0, call.channels, workspace.reference);
         for (int s = 0; s < int(tile.count); s++) {

@@ -174,6 +174,19 @@ void prepare_view(const Call &call, int64_t scene, int64_t number, double reach_
     view.terms_z = columns[2];
 }
 
+// Ask for huge pages: a fresh page of 4 KiB costs about as much as filling it.
+void use_huge_pages(void *start, int64_t bytes) {
+#if defined(__linux__) && defined(MADV_HUGEPAGE)
+    const uintptr_t huge = uintptr_t(1) << 21;
+    const uintptr_t first = (reinterpret_cast<uintptr_t>(start) + huge - 1) & ~(huge - 1);
+    const uintptr_t last = (reinterpret_cast<uintptr_t>(start) + uintptr_t(bytes)) & ~(huge - 1);
+    if (first < last) madvise(reinterpret_cast<void *>(first), last - first, MADV_HUGEPAGE);
+#else
+    (void)start;
+    (void)bytes;
+#endif
+}
+
 // Run a call; nonzero when memory ran out.
 int run(const Call &call, bool backward) {
     Plan plan = {};
@@ -229,6 +242,7 @@ int run(const Call &call, bool backward) {
     auto body = [&]() {
         std::unique_ptr<char[]> memory(new (std::nothrow) char[size_t(bytes)]);
         if (!memory) return;
+        if (sums) use_huge_pages(memory.get(), bytes);
         Workspace workspace;
         char *place = memory.get();
         auto reserve = [&](int64_t size) {
@@ -282,15 +296,4 @@ EXPORT const char *lsmgeo_instruction_set(const char *name) {
     return name ? nullptr : chosen.name;
 }
 
-// Ask for huge pages: a fresh page of 4 KiB costs about as much as filling it.
-EXPORT void lsmgeo_use_huge_pages(void *start, int64_t bytes) {
-#if defined(__linux__) && defined(MADV_HUGEPAGE)
-    const uintptr_t huge = uintptr_t(1) << 21;
-    const uintptr_t first = (reinterpret_cast<uintptr_t>(start) + huge - 1) & ~(huge - 1);
-    const uintptr_t last = (reinterpret_cast<uintptr_t>(start) + uintptr_t(bytes)) & ~(huge - 1);
-    if (first < last) madvise(reinterpret_cast<void *>(first), last - first, MADV_HUGEPAGE);
-#else
-    (void)start;
-    (void)bytes;
-#endif
-}
+EXPORT void lsmgeo_use_huge_pages(void *start, int64_t bytes) { use_huge_pages(start, bytes); }

@@ -250,8 +250,8 @@ INLINE float tap_weight(const Tile &tile, int s, int tap, int without = 0) {
 }
 
 // out (+)= sum of N taps times their weights.
-template <int N, class S>
-INLINE void weighted_sum(const S *const *place, const float *weight, int64_t channels, float *out, bool add) {
+template <int N, class S, class Out>
+INLINE void weighted_sum(const S *const *place, const float *weight, int64_t channels, Out *out, bool add) {
     over_channels(channels, [&](auto width, int64_t c) INLINED {
         constexpr int W = decltype(width)::value;
         Floats<W> sum = weight[0] * load<W>(place[0] + c);
@@ -262,12 +262,12 @@ INLINE void weighted_sum(const S *const *place, const float *weight, int64_t cha
 }
 
 // The value at site s times a factor, written to `out` or added to it.
-template <int DIMS, class S>
+template <int DIMS, class S, class Out>
 inline void gather(const Call &call, const Tile &tile, int s, const S *source, const int64_t *stride, int64_t channels,
-                   float *out, float factor = 1.0f, bool add = false) {
+                   Out *out, float factor = 1.0f, bool add = false) {
     constexpr int N = 1 << DIMS;
     if (!tile.in_range[s]) {
-        if (!add) std::memset(out, 0, size_t(channels) * sizeof(float));
+        if (!add) std::memset(out, 0, size_t(channels) * sizeof(Out));
         return;
     }
     const S *corner = source + cell_offset<DIMS>(tile, s, stride);

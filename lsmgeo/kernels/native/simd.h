@@ -41,6 +41,10 @@ template <int W> INLINE Floats<W> load(const float *place) {
     return values;
 }
 template <int W> INLINE Bits<W> load_halves(const uint16_t *place) {
+#if LANES > 4
+    if constexpr (W == 8)
+        return Bits<8>(_mm256_cvtepu16_epi32(_mm_loadu_si128(reinterpret_cast<const __m128i *>(place))));
+#endif
     typename Vector<W>::Halves halves;
     std::memcpy(&halves, place, sizeof halves);
     return __builtin_convertvector(halves, Bits<W>);
@@ -63,6 +67,12 @@ template <int W> INLINE Floats<W> load(const Float16 *place) {
 template <class S> INLINE float to_float(const S &value) { return load<1>(&value)[0]; }
 
 template <int W> INLINE Floats<W> clamped_lanes(Floats<W> values, float largest) {
+#if LANES > 4
+    if constexpr (W == 8) {  // of a NaN and a number these instructions choose the second
+        const __m256 below = _mm256_min_ps(_mm256_set1_ps(largest), __m256(values));
+        return Floats<8>(_mm256_max_ps(_mm256_set1_ps(-largest), below));
+    }
+#endif
     const Floats<W> below = values > largest ? Floats<W>{} + largest : values;
     return below < -largest ? Floats<W>{} - largest : below;
 }
@@ -71,6 +81,14 @@ template <int W> INLINE Floats<W> clamped_lanes(Floats<W> values, float largest)
 // number become that number.
 template <int W> INLINE void store(float *place, Floats<W> values) { std::memcpy(place, &values, sizeof values); }
 template <int W> INLINE void store_halves(uint16_t *place, Bits<W> bits) {
+#if LANES > 4
+    if constexpr (W == 8) {
+        const __m256i all = __m256i(bits);
+        const __m128i halves = _mm_packus_epi32(_mm256_castsi256_si128(all), _mm256_extracti128_si256(all, 1));
+        _mm_storeu_si128(reinterpret_cast<__m128i *>(place), halves);
+        return;
+    }
+#endif
     const auto halves = __builtin_convertvector(bits, typename Vector<W>::Halves);
     std::memcpy(place, &halves, sizeof halves);
 }

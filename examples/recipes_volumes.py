@@ -13,10 +13,11 @@ from lsmgeo.functional import sample_views, sample_volume, splat, unproject_poin
 from lsmgeo.rays import composite
 
 
-def scaled(cameras: CameraTensors, x: float, y: float, size: tuple[int, int]) -> CameraTensors:
+def scaled(cameras: CameraTensors, x: float | Tensor, y: float | Tensor, size: tuple[int, int]) -> CameraTensors:
     """Cameras of a map of `size` (h, w) whose pixel (x u, y v) is the image's (u, v), as many originals do."""
-    scale = cameras.intrinsics.new_tensor([x, y, 1.0])
-    return CameraTensors(scale[:, None] * cameras.intrinsics, cameras.cam_from_world, *size)
+    K = cameras.intrinsics
+    scale = torch.stack(torch.broadcast_tensors(*(torch.as_tensor(side).to(K) for side in (x, y, 1.0))), -1)
+    return CameraTensors(scale[..., None] * K, cameras.cam_from_world, *size)
 
 
 def lift_splat(features: Tensor, logits: Tensor, cameras: CameraTensors, grid: VoxelGrid, depths: Tensor) -> Tensor:

@@ -177,6 +177,8 @@ def splat_sites(
     tensors = as_tensors(cameras, who)
     count = prod(leading_shape(tensors))
     if weights is None:
+        if isinstance(features, Tensor) and features.dim() == 5:
+            raise ShapeError(f"{who}: features must be (B, V, C, P, h, w) without weights; got {tuple(features.shape)}")
         views = check_features(who, features, count, "(B, V, C, P, h, w)")
     else:
         views = check_features(who, features, count)
@@ -185,6 +187,9 @@ def splat_sites(
             raise DTypeError(f"{who}: weights must be of the features' {features.dtype}; got {weights.dtype}")
     _check_voxel_grid(who, grid)
     height, width = features.shape[-2:]
+    if isinstance(depths, Tensor) and depths.dim() == 5 and tuple(depths.shape[-2:]) != (height, width):
+        size = f"the features' (h, w) = {(height, width)}"
+        raise ShapeError(f"{who}: depths must be {DEPTHS[5]} with {size}; got {tuple(depths.shape)}")
     given = {"features": features} if weights is None else {"features": features, "weights": weights}
     sites = _frustum_sites(who, given, tensors, views, grid, depths, (1, 2, 3, 5), (height, width), view_mask, options)
     planes = (*views, sites.counts()[0], height, width)

@@ -145,8 +145,8 @@ def splat(
     With depth probabilities as `weights` it is the lift and splat of Philion and Fidler, "Lift, Splat, Shoot", 2020.
 
     Convention:
-        Integer pixel centres; K is resized to the feature map. A sample in the outer half voxel fades; samples outside
-        the volume, on planes at or behind `near`, and of masked views add nothing.
+        Integer pixel centres; K is resized to the feature map. Samples fade from the outermost voxel centres to one
+        voxel out; those further out, on planes at or behind `near`, and of masked views add nothing.
 
     Args:
         features: (B, V, C, h, w) with `weights`, or (B, V, C, P, h, w) without.

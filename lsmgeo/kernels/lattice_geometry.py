@@ -149,8 +149,8 @@ def recenter(points: Tensor) -> tuple[Tensor, Tensor]:
     """An origin amid the points of each scene, (B, 3) float64, and the points relative to it.
 
     Applied to coordinates far from their origin, float32 loses pixels; a matrix composed in float64 takes in the origin
-    (`recentered_matrix`). The origin lies on a coarse lattice, so that no digit of a coordinate is lost, and is not
-    moved where it is near the points.
+    (`recentered_matrix`). The origin lies on a coarse lattice, so that no digit of a coordinate is lost. It stays where
+    it is unless it is many times as far away as the points are from each other: some may be next to it.
     """
     double = points.double()
     known = double.detach()
@@ -158,7 +158,8 @@ def recenter(points: Tensor) -> tuple[Tensor, Tensor]:
     mean = known.sum(1) / count
     spread = torch.cat((torch.zeros_like(mean[:, None]), (known - mean[:, None]).abs()), 1).amax((1, 2))[:, None]
     step = power_of_two_above(spread)
-    origin = torch.where(spread > 0, torch.round(mean / step) * step, mean)
+    is_far = mean.abs().amax(-1, keepdim=True) > 8.0 * spread
+    origin = torch.where(is_far, torch.where(spread > 0, torch.round(mean / step) * step, mean), 0.0)
     return origin, double - origin[:, None]
 
 

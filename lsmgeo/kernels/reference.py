@@ -415,7 +415,7 @@ def splat(features: Tensor, sites: Sites, weights: Tensor | None, shape: Sequenc
             at = lower[axis].long() + step
             inside = inside & (at >= 0) & (at < size)
             cell = cell + at * prod(sizes[:axis])
-        part = (values * torch.where(inside, weight, 0.0)[:, :, None]).movedim(2, -1)
+        part = torch.where(inside[:, :, None], values * weight[:, :, None], 0.0).movedim(2, -1)
         volume = volume.index_add(0, torch.where(inside, cell, 0).flatten(), part.flatten(0, 4))
     return volume.view(B, *shape, C).movedim(-1, 1)
 

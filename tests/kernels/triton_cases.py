@@ -449,6 +449,29 @@ CASES["shared, splat in half precision"] = partial(shared.HALF["splat, float16"]
 
 
 @case
+def splats_read_only_what_they_add() -> None:
+    """NaN in masked views, behind the near plane, and at samples outside the volume."""
+    features, weights = shared.MAPS.clone(), shared.SHARES.clone()
+    features[~shared.MASK], weights[~shared.MASK] = torch.nan, torch.nan
+    weights[:, :, shared.DEPTHS <= 1.2] = torch.nan
+    inside = functional.plane_sweep_project(
+        torch.ones(shared.B, 1, *shared.GRID.shape), *shared.SPLAT, shared.SIZE, flatten=False
+    ).maps[:, :, 0]
+    weights[inside == 0] = torch.nan
+    depths = shared.DEPTHS.clone()
+    leaves = [leaf.requires_grad_() for leaf in (features, weights, depths)]
+    answers = []
+    for backend in ("triton", "reference"):
+        options = {"weights": weights, "view_mask": shared.MASK, "near": 1.2, "backend": backend}
+        volume = functional.splat(features, *shared.SPLAT[:2], depths, **options)
+        answers.append((volume, *torch.autograd.grad(volume.square().sum(), leaves)))
+    for found, expected in zip(*answers, strict=True):
+        assert expected.isfinite().all()
+        assert expected.any()
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max()))
+
+
+@case
 def deterministic_splats() -> None:
     """The same bits from run to run, and integers exactly."""
     features, weights = shared.MAPS.mul(16).round(), shared.SHARES.mul(8).round()

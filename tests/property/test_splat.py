@@ -245,6 +245,31 @@ def test_masked_views_and_planes_behind_are_unread(backend, padding_mode):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("mode", ["trilinear", "nearest"])
+def test_a_nan_reaches_only_the_voxels_it_is_added_to(mode, backend):
+    """Neither another scene, nor the gradients at samples outside the volume; nor does one in the incoming gradient."""
+    grid = VoxelGrid((1, 1, 4), lower=(-2.0, -0.5, 0.5), upper=(2.0, 0.5, 1.5))
+    camera = plain_camera(torch.float32, (1, 1))
+    camera = CameraTensors(
+        *(torch.as_tensor(field).expand(2, 1, *torch.as_tensor(field).shape[2:]) for field in camera)
+    )
+    depths = torch.tensor([1.0, 3.0])  # the second is outside
+    features, weights = torch.ones(2, 1, 1, 1, 1), torch.ones(2, 1, 2, 1, 1)
+    features[1] = torch.nan
+    leaves = [leaf.requires_grad_() for leaf in (features, weights)]
+    volume = functional.splat(features, camera, grid, depths, weights=weights, mode=mode, backend=backend)
+    expected = [0.0, 0.5, 0.5, 0.0] if mode == "trilinear" else [0.0, 0.0, 1.0, 0.0]
+    assert volume[0].flatten().tolist() == expected
+    assert volume[1].isnan().flatten().tolist() == [value > 0 for value in expected]
+    cotangent = torch.ones_like(volume)
+    cotangent[0, ..., 0] = torch.nan  # read by no sample
+    to_features, to_weights = torch.autograd.grad(volume, leaves, cotangent)
+    assert to_features.flatten().tolist() == [1.0, 1.0]
+    assert to_weights[:, 0, 1].flatten().tolist() == [0.0, 0.0]
+    assert to_weights[0, 0, 0].item() == 1.0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_batches_are_loops_and_views_add_up(backend):
     whole = functional.splat(cases.MAPS, *cases.SPLAT, weights=cases.SHARES, backend=backend)
     for b in range(cases.B):
@@ -296,7 +321,7 @@ BAD = {
     ),
     "no weights": (
         {"weights": None}, ShapeError,
-        "Splat: features must be (B, V, C, P, h, w) with B*V = 6 cameras; got (2, 3, 5, 5, 6)",
+        "Splat: features must be (B, V, C, P, h, w) without weights; got (2, 3, 5, 5, 6)",
     ),
     "weights and planes": (
         {"features": cases.PLANE_MAPS}, ShapeError,
@@ -310,7 +335,8 @@ BAD = {
         {"grid": FrustumGrid(cases.CAMERA, cases.DEPTHS)}, DTypeError, "Splat: grid must be a VoxelGrid; got",
     ),
     "pixels of another size": (
-        {"depths": cases.PIXEL_DEPTHS[..., :4]}, ShapeError, "Splat: size must be that of the depths of each pixel",
+        {"depths": cases.PIXEL_DEPTHS[..., :4]}, ShapeError,
+        "Splat: depths must be (B, V, P, h, w) with the features' (h, w) = (5, 6); got (2, 3, 4, 5, 4)",
     ),
     "descending": (
         {"depths": cases.DEPTHS.flip(0)}, GridError, "Splat: depths must be positive, finite and strictly ascending",

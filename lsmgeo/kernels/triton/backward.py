@@ -121,7 +121,7 @@ def _tap_gradients(grad, source, into, scale, view, projection, channel, exists,
         if CONFIG.needs_geometry and not CONFIG.nearest:
             addresses = _addresses(source, _view_start(source, view, n), z, y, x, channel)
             value = tl.load(addresses, mask=mask, other=0.0).to(tl.float32)
-            product = tl.sum(grad * value, 1)
+            product = tl.sum(tl.where(mask, grad, 0.0) * value, 1)  # a NaN counts only where something is read
             grad_x += product * weight_y * weight_z * (1.0 if corner % 2 else -1.0)
             grad_y += product * weight_x * weight_z * (1.0 if corner // 2 % 2 else -1.0)
             grad_z += product * weight_x * weight_y * (1.0 if corner // 4 else -1.0)
@@ -146,9 +146,8 @@ def _correlation_gradients(grad, source, into, lattice, view, projection, site, 
             array = into.reference
             addresses = _addresses(array, _view_start(array, view, n), site.k, site.j, site.i, channel)
             sampled = _sampled(source, view, projection, channel, exists, n, CONFIG)
-            _scatter(
-                array, into.reference_scale, addresses, each * sampled, projection.front[:, None] & exists[None, :]
-            )
+            mask = projection.front[:, None] & exists[None, :]
+            _scatter(array, into.reference_scale, addresses, each * sampled, mask)
         each = each * _reference(lattice, view, projection, site, channel, exists, n)
         x, y, z = _tap_gradients(
             each, source, into.source, into.source_scale, view, projection, channel, exists, n, CONFIG

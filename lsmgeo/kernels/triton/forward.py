@@ -1,12 +1,7 @@
 """The Triton kernel that resamples; `backward` has its vector-Jacobian product, `operators` launches both.
 
-Both serve three kinds of sites: those of a lattice in images, those of frustums in volumes, and given pixels. A program
-works on a tile: a block of consecutive sites by a block of channels, of one view, or of all views one after another
-where a statistic over them is requested. Projections and moments over the views are recomputed instead of stored.
-Features and geometric channels are two tiles of different width; `PART` selects one. Only `_values` and its derivative
-differ between them.
-
-Importing this module imports Triton.
+Sites are those of a lattice in images, those of frustums in volumes, or given pixels. A program works on a tile: sites
+by channels, of a view, or of all views for a statistic. `PART` says whether of features or of geometric channels.
 """
 
 # mypy: disallow-untyped-defs=False, disallow-incomplete-defs=False, disallow-untyped-decorators=False
@@ -118,6 +113,12 @@ def _inside(index, size):
 
 
 @triton.jit
+def _reaches(index, size, CONFIG: tl.constexpr):  # whether a sample reads any cell
+    MARGIN: tl.constexpr = 0.5 if CONFIG.nearest else 0.0
+    return (index >= MARGIN - 1.0) & (index < size - MARGIN) | CONFIG.border
+
+
+@triton.jit
 def _project(lattice, points, view, site, n, near, CONFIG: tl.constexpr):
     """The `Projection` of a program's sites in one view."""
     inverse = tl.zeros([CONFIG.sites], tl.float32)
@@ -140,6 +141,7 @@ def _project(lattice, points, view, site, n, near, CONFIG: tl.constexpr):
         x = _volume_index(table, site, distance, front)
         y = _volume_index(table + 4, site, distance, front)
         z = _volume_index(table + 8, site, distance, front)
+        front = front & _reaches(x, n.cells_x, CONFIG) & _reaches(y, n.cells_y, CONFIG) & _reaches(z, n.cells_z, CONFIG)
     else:
         table = lattice.views + view * FIELDS
         unmasked = _is_unmasked(table, site)
@@ -261,13 +263,11 @@ def _extra_offsets(points, view, site, n, CONFIG: tl.constexpr):
 
 @triton.jit
 def _sampled(source, view, projection, channel, exists, n, CONFIG: tl.constexpr):
-    """The interpolated channels (sites, channels)."""
-    cell = _cell(projection, n, CONFIG)
-    start = _view_start(source, view, n)
+    """The interpolated channels (sites, channels). Sites not in front read nothing, so that a NaN does no harm."""
+    cell, start = _cell(projection, n, CONFIG), _view_start(source, view, n)
     values = tl.zeros([CONFIG.sites, CONFIG.channels], tl.float32)
     for corner in tl.static_range(CONFIG.corners):
         x, y, z, weight_x, weight_y, weight_z, inside = _tap(cell, n, corner, CONFIG)
-        # Sites not in front read nothing, so that a NaN in the features does no harm.
         mask = (projection.front & inside)[:, None] & exists[None, :]
         value = tl.load(_addresses(source, start, z, y, x, channel), mask=mask, other=0.0).to(tl.float32)
         values += value * (weight_x * weight_y * weight_z)[:, None]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lsmgeo import functional
 from tests import oracle, tolerances
+from tests.kernels import cases
 from tests.property import support
 from tests.strategies import scenes
 
@@ -76,3 +78,14 @@ def test_gradient_with_respect_to_pixels_is_the_slope(scene):
     values, _ = functional.sample_views(ramp, pixels, ones, ones.bool())
     values.sum().backward()
     torch.testing.assert_close(pixels.grad, torch.tensor([2.0, -3.0], dtype=torch.float64).expand(1, 1, 20, 2))
+
+
+@pytest.mark.parametrize("companion", [1e2, 1e6, 1e10])
+def test_a_far_point_takes_no_digit_from_the_others(companion):
+    """float32 coordinates are exact about the origin, whatever else is read in the same call."""
+    near = torch.tensor([[[0.11, 0.2, 0.05], [-0.3, 0.1, 0.2]]])
+    far = torch.cat((near, torch.tensor([[[companion, 0.0, 0.0]]]).expand(1, 3, 3)), 1)
+    features, views = cases.FEATURES[:1], cases.VIEWS.at(slice(0, 1))
+    expected = functional.unproject_points(features, views, near).volume
+    assert expected.any()
+    torch.testing.assert_close(functional.unproject_points(features, views, far).volume[..., :2], expected)

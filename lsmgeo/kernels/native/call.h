@@ -21,9 +21,9 @@ struct Call {
 
     const void *source;
     int64_t source_type, source_stride[5];
-    const void *original;          // where its channels are not adjacent: `source` is memory for a copy; or null
+    const void *original;          // in place of `source` where its channels are not adjacent; or null
     int64_t original_stride[6];    // scene, view, channel, z, y, x
-    uint8_t *ready;                // zeros: of the copy's segments of 32 pixels, (B, V or 1, z, y, segments of x)
+    uint8_t *ready;                // set by the kernels, see copies.h
     const double *matrix, *direction_matrix;  // (B, V, 3, 4), or null
     const double *x, *y, *z;
     int64_t z_stride[3];           // scene, view, plane

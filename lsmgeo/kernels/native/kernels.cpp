@@ -56,6 +56,8 @@ struct Plan {
     bool along_z, backward;
 };
 
+#include "copies.h"
+
 struct TileSizes { int64_t tile, site_gradients, length; };  // bytes, bytes, sites
 
 // The memory of one thread.
@@ -235,6 +237,13 @@ int run(const Call &call, bool backward) {
     // Each thread starts with its own part and then helps the others: two threads next to each other would fault in,
     // and clear, the same fresh pages.
     const int64_t threads = std::max<int64_t>(1, std::min(call.threads, tasks));
+    // Where each thread has several views, or scenes, to itself, it copies one at a time; else all share one copy.
+    const int64_t views_of_task = call.kind == PLANE_SWEEP_PROJECT || !whole_scenes ? 1 : call.views;
+    const int64_t images = call.kind == PLANE_SWEEP_PROJECT || whole_scenes ? call.scenes : parts;
+    const int64_t tasks_of_image = tasks / images;
+    const bool share = images < 2 * threads;
+    Copies shared;
+    if (share && !shared.reserve(call, call.scenes, call.kind == PLANE_SWEEP_PROJECT ? 1 : call.views)) return 1;
     std::unique_ptr<std::atomic<int64_t>[]> next(new (std::nothrow) std::atomic<int64_t>[size_t(threads)]);
     if (!next) return 1;
     for (int64_t part = 0; part < threads; part++) next[size_t(part)] = part * tasks / threads;
@@ -243,6 +252,11 @@ int run(const Call &call, bool backward) {
         std::unique_ptr<char[]> memory(new (std::nothrow) char[size_t(bytes)]);
         if (!memory) return;
         if (sums) use_huge_pages(memory.get(), bytes);
+        Copies its_own;
+        if (!share && !its_own.reserve(call, 1, views_of_task)) return;
+        Plan plan_of_thread = plan;
+        plan_of_thread.call = share ? &shared.call : &its_own.call;
+        int64_t image = -1;
         Workspace workspace;
         char *place = memory.get();
         auto reserve = [&](int64_t size) {
@@ -267,7 +281,11 @@ int run(const Call &call, bool backward) {
         for (int64_t offset = 0; offset < threads; offset++) {
             const int64_t part = (own + offset) % threads, last = (part + 1) * tasks / threads;
             std::atomic<int64_t> &counter = next[size_t(part)];
-            for (int64_t task = counter++; task < last; task = counter++) chosen.run(plan, task, workspace);
+            for (int64_t task = counter++; task < last; task = counter++) {
+                if (!share && task / tasks_of_image != image) its_own.forget();
+                image = task / tasks_of_image;
+                chosen.run(plan_of_thread, task, workspace);
+            }
         }
     };
     run_on_threads(threads, body);

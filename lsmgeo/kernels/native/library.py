@@ -22,7 +22,6 @@ TYPES = {torch.float32: 0, torch.bfloat16: 1, torch.float16: 2, torch.float64: 3
 SOURCE_TYPES = (torch.float32, torch.bfloat16, torch.float16)
 STATISTICS = {"mean": 0, "variance": 1, "max": 2}
 LEAST_CHUNK = 8  # channels of a task
-SEGMENT = 32  # pixels of native/sources.h
 
 
 def why_not(operator: str, source: Tensor, options: Options) -> str | None:
@@ -71,18 +70,11 @@ def _source_strides(source: Tensor, axis: int) -> tuple[int, ...]:
     return scene, *(views or [0]), depth, *sides
 
 
-def _set_copy(call: Call, source: Tensor, axis: int) -> tuple[Tensor, ...]:
-    """Set memory for a copy with adjacent channels, where they are not; the kernel fills what it reads."""
-    if source.shape[axis] < 2 or source.stride(axis) == 1:
-        return ()
-    copy = empty(source.shape, source.dtype, [*(other for other in range(source.dim()) if other != axis), axis])
-    segments = -(-call.size[0] // SEGMENT)
-    ready = torch.zeros((*source.shape[:axis], *call.size[2:0:-1], segments), dtype=torch.uint8, device="cpu")
-    scene, view, *sides = call.source_stride
-    call.original, call.original_stride[:] = source.data_ptr(), (scene, view, source.stride(axis), *sides)
-    call.source, call.ready = copy.data_ptr(), ready.data_ptr()
-    call.source_stride[:] = _source_strides(copy, axis)
-    return copy, ready
+def _set_original(call: Call, source: Tensor, axis: int) -> None:
+    """Have the kernels copy what they read of a source whose channels are not adjacent."""
+    if source.shape[axis] > 1 and source.stride(axis) != 1:
+        scene, view, *sides = call.source_stride
+        call.original, call.original_stride[:] = source.data_ptr(), (scene, view, source.stride(axis), *sides)
 
 
 def _set_sites(call: Call, sites: Sites, options: Options) -> tuple[Tensor | None, ...]:
@@ -183,8 +175,9 @@ def _lattice_call(
 ) -> tuple[Call, tuple[Tensor | None, ...]]:
     """A call on the sites of a lattice, and what must live as long as it."""
     call = _new_call(kind, source, options, sites.counts()[::-1])
-    copy = _set_copy(call, source, _channel_axis(kind)) if reads_source else ()
-    return call, (*copy, *_set_sites(call, sites, options))
+    if reads_source:
+        _set_original(call, source, _channel_axis(kind))
+    return call, _set_sites(call, sites, options)
 
 
 def _is_linear(options: Options, appended: bool) -> bool:
@@ -296,13 +289,14 @@ def _pixels_call(
     source: Tensor, pixels: Tensor, front: Tensor, extra: Tensor | None, options: Options, reads_source: bool = True
 ) -> tuple[Call, tuple[Tensor | None, ...]]:
     call = _new_call(SAMPLE_VIEWS, source, options, (front.shape[-1], 1, 1))
-    copy = _set_copy(call, source, 2) if reads_source else ()
+    if reads_source:
+        _set_original(call, source, 2)
     pixels, front = pixels.float().contiguous(), front.contiguous()
     extras = None if extra is None else extra.float().movedim(2, 3).contiguous()
     call.pixels, call.front = pixels.data_ptr(), front.data_ptr()
     call.extra = 0 if extras is None else extras.shape[3]
     call.extras = None if extras is None else extras.data_ptr()
-    return call, (*copy, pixels, front, extras)
+    return call, (pixels, front, extras)
 
 
 def sample_views_backward(

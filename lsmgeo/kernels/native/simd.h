@@ -175,14 +175,17 @@ template <int K, class Row> INLINE void transpose_square(Row *rows) {
 template <class T>
 inline void transpose(const T *from, int64_t from_step, T *to, int64_t to_step, int64_t rows, int64_t columns) {
     typedef T Row __attribute__((vector_size(sizeof(T) * LANES)));
+    typedef T Anywhere __attribute__((vector_size(sizeof(T) * LANES), aligned(sizeof(T)), may_alias));
     int64_t row = 0;
     for (; row + LANES <= rows; row += LANES) {
         int64_t column = 0;
         for (; column + LANES <= columns; column += LANES) {
             Row square[LANES];
-            for (int r = 0; r < LANES; r++) std::memcpy(square + r, from + (row + r) * from_step + column, sizeof(Row));
+            for (int r = 0; r < LANES; r++)
+                square[r] = *reinterpret_cast<const Anywhere *>(from + (row + r) * from_step + column);
             transpose_square<LANES / 2>(square);
-            for (int c = 0; c < LANES; c++) std::memcpy(to + (column + c) * to_step + row, square + c, sizeof(Row));
+            for (int c = 0; c < LANES; c++)
+                *reinterpret_cast<Anywhere *>(to + (column + c) * to_step + row) = square[c];
         }
         for (; column < columns; column++)
             for (int r = 0; r < LANES; r++) to[column * to_step + row + r] = from[(row + r) * from_step + column];

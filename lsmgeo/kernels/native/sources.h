@@ -3,14 +3,13 @@
 // Sources are read with adjacent channels. Of others a copy is filled where it is read, in segments of a row, by
 // whichever thread needs one first; `ready` says how far each is.
 
-constexpr int64_t SEGMENT = 32;
-enum Progress : uint8_t { UNTOUCHED = 0, BEING_FILLED = 1, READY = 2 };
-
 template <class T>
 inline void copy_segment(const Call &call, int64_t row_start, int64_t copy_start, int64_t count) {
     const T *from = static_cast<const T *>(call.original) + row_start;
     T *to = static_cast<T *>(const_cast<void *>(call.source)) + copy_start;
     const int64_t across = call.original_stride[2], along = call.original_stride[5];
+    for (int64_t c = 0; c < call.channels; c++)
+        for (int64_t x = 0; x < count; x += 64 / int64_t(sizeof(T))) __builtin_prefetch(from + c * across + x * along);
     if (along == 1) return transpose(from, across, to, call.source_stride[4], call.channels, count);
     for (int64_t x = 0; x < count; x++)
         for (int64_t c = 0; c < call.channels; c++) to[x * call.source_stride[4] + c] = from[x * along + c * across];
@@ -34,9 +33,9 @@ inline void fill_segment(const Call &call, const Tile &tile, int64_t z, int64_t 
 // Fills what the sites of a tile read.
 template <int DIMS>
 inline void fill_copy(const Call &call, const Tile &tile) {
-    const int64_t parts = (call.size[0] + SEGMENT - 1) / SEGMENT;
-    const int64_t image = call.kind == PLANE_SWEEP_PROJECT ? tile.scene : tile.scene * call.views + tile.view;
-    uint8_t *ready = call.ready + image * call.size[2] * call.size[1] * parts;
+    const int64_t *stride = call.source_stride, parts = (call.size[0] + SEGMENT - 1) / SEGMENT;
+    const int64_t rows = (tile.scene * stride[0] + tile.view * stride[1]) / stride[3];
+    uint8_t *ready = call.ready + rows * parts;
     int32_t before[3] = {-2, -2, -2};
     for (int s = 0; s < int(tile.count); s++) {
         if (!tile.in_range[s]) continue;

@@ -61,7 +61,7 @@ def channels_last(settings: Settings) -> list[dict[str, Any]]:
 
 
 def contiguous(settings: Settings) -> list[dict[str, Any]]:
-    """Some work, from sources in contiguous memory, which the library copies first."""
+    """Some work, from sources in contiguous memory, of which the library copies what it reads."""
     cases = []
     for label, problem, seconds, _ in WORK:
         if label in COPIED:

@@ -13,7 +13,7 @@ from lsmgeo.cameras import CameraTensors, centers
 def mvsnet_variance(features: Tensor, cameras: CameraTensors, depths: Tensor) -> tuple[Tensor, Tensor]:
     """MVSNet: the variance over all views, and where it is meaningful: at least two views see the site."""
     frustum = FrustumGrid(cameras.at((slice(None), 0)), depths, size=tuple(features.shape[-2:]))
-    volume, visible = Unproject(frustum, reduce="variance")(features, cameras)
+    volume, visible = Unproject(frustum, reduce="variance", padding_mode="border")(features, cameras)
     return volume, visible.sum(1) >= 2
 
 
@@ -21,10 +21,10 @@ def casmvsnet_stage(
     features: Tensor, cameras: CameraTensors, depth: Tensor, interval: float, planes: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """A CasMVSNet stage: hypotheses (B, P, h, w) around a depth map (B, h, w), their variance, and where it counts."""
-    offsets = interval * (torch.arange(planes, dtype=depth.dtype, device=depth.device) - planes // 2)
+    offsets = interval * (torch.arange(planes, dtype=depth.dtype, device=depth.device) - (planes - 1) / 2)
     hypotheses = (depth[:, None] + offsets[:, None, None]).clamp_min(1e-3)
     frustum = FrustumGrid(cameras.at((slice(None), 0)), hypotheses)
-    volume, visible = Unproject(frustum, reduce="variance")(features, cameras)
+    volume, visible = Unproject(frustum, reduce="variance", padding_mode="border")(features, cameras)
     return hypotheses, volume, visible.sum(1) >= 2
 
 
@@ -47,13 +47,13 @@ def patchmatchnet_step(
 def groupwise_correlation(features: Tensor, cameras: CameraTensors, depths: Tensor, groups: int) -> Tensor:
     """Group-wise correlation, the mean over the source views that see the site."""
     frustum = FrustumGrid(cameras.at((slice(None), 0)), depths, size=tuple(features.shape[-2:]))
-    match = Unproject(frustum, groups=groups, reduce="mean")
+    match = Unproject(frustum, groups=groups, reduce="mean", padding_mode="border")
     sources = cameras.at((slice(None), slice(1, None)))
     return match(features[:, 1:], sources, reference=features[:, 0, :, None]).volume
 
 
 def simplerecon_volume(features: Tensor, cameras: CameraTensors, depths: Tensor) -> Tensor:
-    """SimpleRecon: a dot product for each source view and its metadata, (B, V - 1, 7, P, h, w), for an MLP."""
+    """SimpleRecon: a dot product for each source view and its metadata, (B, V - 1, 8, P, h, w), for an MLP."""
     own, sources = cameras.at((slice(None), slice(1))), cameras.at((slice(None), slice(1, None)))
     frustum = FrustumGrid(own.at((slice(None), 0)), depths, size=tuple(features.shape[-2:]))
     unproject = Unproject(frustum, augment=("depth", "direction"))

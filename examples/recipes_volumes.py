@@ -63,7 +63,7 @@ def bevformer_attention(
 
 def simple_bev(features: Tensor, cameras: CameraTensors, grid: VoxelGrid) -> Tensor:
     """Simple-BEV: the mean over the views that see a voxel, height in the channels: (B, C D, H, W)."""
-    return Unproject(grid, reduce="mean")(features, cameras).volume.flatten(1, 2)
+    return Unproject(grid, reduce="mean", padding_mode="border")(features, cameras).volume.flatten(1, 2)
 
 
 def imvoxelnet_volume(features: Tensor, cameras: CameraTensors, grid: VoxelGrid) -> tuple[Tensor, Tensor]:
@@ -87,7 +87,7 @@ def neuralrecon_points(features: Tensor, cameras: CameraTensors, points: Tensor)
 
     The last channel is the mean depth, standardised over the voxels that are seen.
     """
-    volume, visible = unproject_points(features, cameras, points, augment="depth", reduce="mean")
+    volume, visible = unproject_points(features, cameras, points, augment="depth", reduce="mean", padding_mode="border")
     count = visible.sum(1)  # (B, N)
     depth = volume[:, -1]
     mean = depth.sum(1, keepdim=True) / (count > 0).sum(1, keepdim=True).clamp_min(1)

@@ -221,7 +221,8 @@ def splat_sites(
     count = prod(leading_shape(tensors))
     if weights is None:
         if isinstance(features, Tensor) and features.dim() == 5:
-            raise ShapeError(f"{who}: features must be (B, V, C, P, h, w) without weights; got {tuple(features.shape)}")
+            expected = "(B, V, C, P, h, w), or (B, V, C, h, w) with weights= (B, V, P, h, w)"
+            raise ShapeError(f"{who}: features must be {expected}; got {tuple(features.shape)} without weights")
         views = check_features(who, features, count, "(B, V, C, P, h, w)")
     else:
         views = check_features(who, features, count)

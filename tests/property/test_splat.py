@@ -321,7 +321,7 @@ BAD = {
     ),
     "no weights": (
         {"weights": None}, ShapeError,
-        "Splat: features must be (B, V, C, P, h, w) without weights; got (2, 3, 5, 5, 6)",
+        "got (2, 3, 5, 5, 6) without weights",
     ),
     "weights and planes": (
         {"features": cases.PLANE_MAPS}, ShapeError,

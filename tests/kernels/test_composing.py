@@ -13,12 +13,12 @@ from lsmgeo import FrustumGrid, VoxelGrid, _sites, depth_planes, functional
 from lsmgeo.cameras import orbit
 from lsmgeo.errors import CameraError
 from lsmgeo.kernels.native import composing
-from lsmgeo.kernels.native.loading import composer
+from lsmgeo.kernels.native.loading import missing
 from lsmgeo.kernels.request import Options, Sites
 from tests import strategies
 from tests.property import support
 
-pytestmark = pytest.mark.skipif(composer(composing.FIELDS.size) is None, reason="the C++ library is not built")
+pytestmark = pytest.mark.skipif(missing() is not None, reason="the C++ library is not built")
 
 FRAMES = ("", "world", "camera")
 VIEWS = orbit(torch.tensor([[0.0, 80.0, 200.0], [10.0, 120.0, 300.0]]), 20.0, 2.0, focal_length=9.0, height=8, width=11)

@@ -82,8 +82,7 @@ void multiply(const double *left, const double *right, int rows, double *product
 void compose_view(const Geometry &call, const CameraValues &camera, const double *grid, int64_t at) {
     const auto &E = camera.E;
     double K[3][3] = {{}, {}, {0.0, 0.0, 1.0}};  // resized
-    // A product, as PyTorch divides a number by a tensor: the answers are equal to the last bit.
-    const double scales[2] = {1.0 / camera.width * call.new_width, 1.0 / camera.height * call.new_height};
+    const double scales[2] = {call.new_width / camera.width, call.new_height / camera.height};
     for (int row = 0; row < 2; row++)
         for (int column = 0; column < 3; column++)
             K[row][column] = scales[row] * camera.K[row][column] + (0.5 * scales[row] - 0.5) * (column == 2);

@@ -6,7 +6,7 @@ They are optional: without a C++ compiler the package installs and runs on PyTor
 from setuptools import Extension, setup
 
 NATIVE = "lsmgeo/kernels/native"
-HEADERS = ("call", "geometry", "resample", "simd", "sampling", "sources", "copies", "forward", "backward")
+HEADERS = ("call", "resample", "simd", "sampling", "sources", "copies", "forward", "backward")
 
 setup(
     ext_modules=[

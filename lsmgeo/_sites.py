@@ -13,13 +13,12 @@ from torch import Tensor
 
 from lsmgeo._checks import check_devices, check_float, check_geometry, describe, moved
 from lsmgeo._linalg import affine_inverse, multiply
-from lsmgeo.cameras.camera_checks import QUICK_CHECKS, check_cameras, check_views, place_views, views_per_scene
+from lsmgeo.cameras.camera_checks import check_views, views_per_scene
 from lsmgeo.cameras.matrices import CameraMatrices, camera_matrices
-from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, image_sizes, leading_shape
+from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, leading_shape
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import DTypeError, GridError, OptionError, ShapeError
-from lsmgeo.grids import DEPTHS, FrustumGrid, Lattice, VoxelGrid, check_depths, check_pixel_depths, indices, map_size
-from lsmgeo.kernels.native.composing import CHECKS, FRUSTUMS, IMAGES, LATTICE, compose
+from lsmgeo.grids import DEPTHS, FrustumGrid, Lattice, VoxelGrid, check_depths, check_pixel_depths, map_size
 from lsmgeo.kernels.request import Options, Sites
 
 __all__ = [
@@ -79,10 +78,7 @@ def _lattice(who: str, grid: Grid, source: Tensor) -> Lattice:
         raise DTypeError(f"{who}: grid must be a VoxelGrid or a FrustumGrid; got {describe(grid)}")
     if not isinstance(source, Tensor):
         return grid.lattice()
-    if isinstance(grid, VoxelGrid):
-        lattice = grid.lattice(source.device)
-    else:
-        lattice = grid.lattice(source.device, _world_from_frustum(grid))
+    lattice = grid.lattice(source.device)
     T, z = lattice.world_from_lattice, lattice.z
     for scenes in [tensor.shape[0] for tensor, shared in ((T, 2), (z, 1)) if tensor.dim() > shared]:
         if scenes != source.shape[0]:
@@ -91,38 +87,6 @@ def _lattice(who: str, grid: Grid, source: Tensor) -> Lattice:
                 f"got {scenes}"
             )
     return lattice
-
-
-def _cameras_alone(cameras: CameraTensors) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The fields of cameras (...) as those of scenes of one view."""
-    K, E, (height, width) = cameras.intrinsics, cameras.cam_from_world, image_sizes(cameras)
-    return K.reshape(-1, 1, 3, 3), E.reshape(-1, 1, 4, 4), height.reshape(-1, 1), width.reshape(-1, 1)
-
-
-def _are_valid(cameras: CameraTensors, view_mask: Tensor | None) -> bool:
-    """Whether the native function finds these cameras valid."""
-    mask = None if view_mask is None else view_mask.reshape(-1, 1)
-    return compose(CHECKS, *_cameras_alone(cameras), mask) is not None
-
-
-QUICK_CHECKS.append(_are_valid)
-
-
-def _world_from_frustum(grid: FrustumGrid) -> Tensor | None:
-    """`FrustumGrid.world_from_lattice` from the native function, where it can."""
-    camera = as_tensors(grid.camera)
-    found = compose(LATTICE, *_cameras_alone(camera), size=grid.size)
-    return None if found is None else found[0].reshape(*leading_shape(camera), 4, 4)
-
-
-def _composed(
-    composed: int, cameras: CameraTensors, view_mask: Tensor | None, T: Tensor, size: tuple[int, int], options: Options
-) -> tuple[Tensor, Tensor | None] | None:
-    """M and G from the native function, where it can and the PyTorch path is not requested."""
-    if options.backend == "reference":
-        return None
-    matrices = cameras.intrinsics, cameras.cam_from_world
-    return compose(composed, *matrices, *image_sizes(cameras), view_mask, T, size, options.direction)
 
 
 def direction_matrix(matrices: CameraMatrices, T: Tensor, frame: str) -> Tensor:
@@ -143,24 +107,17 @@ def image_sites(
     reference: Tensor | None = None,
 ) -> Sites:
     """The checked sites of a grid in the views' images."""
-    T, x, y, z, projective = _lattice(who, grid, features)
-    tensors = as_tensors(cameras, who)
-    views = check_features(who, features, prod(leading_shape(tensors)))
-    tensors = place_views(who, tensors, views, view_mask, features=features)
-    size = features.shape[3], features.shape[4]
-    found = _composed(IMAGES, tensors, view_mask, T, size, options)
-    if found is None:
-        check_cameras(who, tensors, view_mask)
-        matrices = camera_matrices(tensors, size, view_mask)
-        T = T if T.dim() == 2 else T[:, None]  # (B, 1, 4, 4): shared by the views
-        direction = direction_matrix(matrices, T, options.direction) if options.direction else None
-        found = multiply(matrices.projection(), T), direction
+    lattice = _lattice(who, grid, features)
+    matrices = image_matrices(who, features, cameras, view_mask)
     _check_reference(who, reference, features, grid, options)
+    T, x, y, z, projective = lattice
+    T = T if T.dim() == 2 else T[:, None]  # (B, 1, 4, 4): shared by the views
     if view_mask is not None and z.dim() == 5:  # depths of pixels that only masked views would read are not read
         z = torch.where(view_mask.any(1)[:, None, None, None, None], z, 1.0)
     if z.dim() == 5:
         check_pixel_depths(who, z[:, 0])
-    return Sites(*found, x, y, z, projective, view_mask)
+    direction = direction_matrix(matrices, T, options.direction) if options.direction else None
+    return Sites(multiply(matrices.projection(), T), direction, x, y, z, projective, view_mask)
 
 
 def _check_reference(who: str, reference: Tensor | None, features: Tensor, grid: Grid, options: Options) -> None:
@@ -305,16 +262,14 @@ def _frustum_sites(
         )
     check_devices(who, **given, depths=depths)
     size = map_size(who, tensors, depths, size)
-    found = _composed(FRUSTUMS, tensors, view_mask, lattice.world_from_lattice, size, options)
-    if found is None:
-        matrices = camera_matrices(tensors, size, view_mask)
-        frustum = matrices.world_from_frustum()
-        inverse = affine_inverse(lattice.world_from_lattice)[..., :3, :]
-        matrix = multiply(inverse if inverse.dim() == 2 else inverse[:, None], frustum)
-        found = matrix, direction_matrix(matrices, frustum, options.direction) if options.direction else None
-    x, y = indices(size[1], source.device), indices(size[0], source.device)
+    matrices = camera_matrices(tensors, size, view_mask)
+    frustum = matrices.world_from_frustum()
+    inverse = affine_inverse(lattice.world_from_lattice)[..., :3, :]
+    matrix = multiply(inverse if inverse.dim() == 2 else inverse[:, None], frustum)
+    direction = direction_matrix(matrices, frustum, options.direction) if options.direction else None
+    x, y = (torch.arange(n, dtype=torch.float64, device=source.device) for n in (size[1], size[0]))
     if view_mask is not None and depths.dim() > 2:  # those of masked views are not read
         depths = torch.where(view_mask.reshape(*views, *(1,) * (depths.dim() - 2)), depths, 1.0)
     check_pixel_depths(who, depths)
     z = depths if depths.dim() == 5 else 1.0 / depths.double()
-    return Sites(*found, x, y, z, True, view_mask)
+    return Sites(matrix, direction, x, y, z, True, view_mask)

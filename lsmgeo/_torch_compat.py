@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from typing import Any, TypeVar
 
 import torch
@@ -13,8 +12,6 @@ from torch.utils._pytree import tree_map  # 2.15
 
 __all__ = [
     "as_constant",
-    "below_autograd",
-    "has_dispatch_modes",
     "has_forward_derivatives",
     "has_function_transforms",
     "is_exporting",
@@ -34,11 +31,6 @@ def has_function_transforms() -> bool:
     return torch._C._are_functorch_transforms_active()  # 2.15
 
 
-def has_dispatch_modes() -> bool:
-    """Whether a mode sees the operations that run: fake tensors, a tracer, a counter."""
-    return torch._C._len_torch_dispatch_stack() > 0  # 2.15
-
-
 def has_forward_derivatives() -> bool:
     """Whether forward-mode derivatives are computed."""
     return forward_ad._current_level >= 0  # 2.15
@@ -47,11 +39,6 @@ def has_forward_derivatives() -> bool:
 def is_jit_traced() -> bool:
     """Whether torch.jit traces the running code."""
     return torch._C._get_tracing_state() is not None  # 2.15
-
-
-def below_autograd() -> AbstractContextManager[None]:
-    """A context whose operations are not recorded, their views included, as inside an operator."""
-    return torch._C._AutoDispatchBelowAutograd()  # 2.15
 
 
 def as_constant(function: Function) -> Function:

@@ -8,9 +8,9 @@ from contextvars import ContextVar
 
 import torch
 
-from lsmgeo._torch_compat import has_dispatch_modes, has_function_transforms
+from lsmgeo._torch_compat import has_function_transforms
 
-__all__ = ["can_inspect", "can_keep_constants", "debug"]
+__all__ = ["can_inspect", "debug"]
 
 PLAIN = (torch.Tensor, torch.nn.Parameter)
 _debug: ContextVar[bool] = ContextVar("lsmgeo_debug", default=False)
@@ -49,10 +49,3 @@ def can_inspect(*tensors: torch.Tensor) -> bool:
     if is_traced() or any(tensor.is_meta or type(tensor) not in PLAIN for tensor in tensors):
         return False
     return _debug.get() or all(tensor.device.type == "cpu" for tensor in tensors)
-
-
-def can_keep_constants(device: torch.device | None) -> bool:
-    """Whether a constant made now on this device is an ordinary tensor that later calls may use."""
-    if is_traced() or device is None or device.type != "cpu":
-        return False
-    return not (has_dispatch_modes() or torch.is_inference_mode_enabled())

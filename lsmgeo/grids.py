@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +30,7 @@ from lsmgeo._torch_compat import is_exporting
 from lsmgeo.cameras.camera_checks import check_cameras, image_size
 from lsmgeo.cameras.matrices import camera_matrices
 from lsmgeo.cameras.tensors import Cameras, CameraTensors, as_tensors, leading_shape
-from lsmgeo.debugging import can_inspect, can_keep_constants
+from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import DTypeError, GridError, ShapeError
 
 __all__ = ["FrustumGrid", "Lattice", "VoxelGrid", "depth_planes"]
@@ -147,7 +145,16 @@ class VoxelGrid:
         if matrix is not None:
             device = matrix.device if device is None else device
             matrix = moved("VoxelGrid", "world_from_grid", matrix, device)
-        box = (_kept_box if can_keep_constants(device) else _box)(self.lower, self.upper, self.shape, device)  # type: ignore[arg-type]
+        lower, upper = self.lower, self.upper
+        counts = tuple(reversed(self.shape))  # type: ignore[arg-type]
+        steps = [(high - low) / n for low, high, n in zip(lower, upper, counts, strict=True)]  # type: ignore[arg-type]
+        firsts = [low + 0.5 * step for low, step in zip(lower, steps, strict=True)]  # type: ignore[arg-type]
+        # Filled on the device: a copy from the host would make a GPU wait.
+        scale, shift = (
+            torch.stack([torch.full((), item, dtype=torch.float64, device=device) for item in items])
+            for items in (steps, firsts)
+        )
+        box = homogeneous_row(torch.cat((torch.diag(scale), shift[:, None]), -1))
         return box if matrix is None else multiply(homogeneous_row(matrix[..., :3, :].double()), box)
 
     @property
@@ -159,34 +166,13 @@ class VoxelGrid:
         """The lattice that the operators take, on a device or on the grid's own."""
         T = self._world_from_lattice(device)
         depth, height, width = self.shape  # type: ignore[misc]
-        x, y, z = (indices(n, T.device) for n in (width, height, depth))
+        x, y, z = (torch.arange(n, dtype=T.dtype, device=T.device) for n in (width, height, depth))
         return Lattice(T, x, y, z, False)
 
     def centers(self) -> Tensor:
         """Voxel centres in the world, (D, H, W, 3) or (B, D, H, W, 3) as x, y, z, of `world_from_grid`'s dtype."""
         dtype = torch.get_default_dtype() if self.world_from_grid is None else self.world_from_grid.dtype
         return self.lattice().centers().to(dtype)
-
-
-def _box(lower: Sequence[float], upper: Sequence[float], shape: Sequence[int], device: torch.device | None) -> Tensor:
-    """World from voxel index of a box along the axes, (4, 4)."""
-    steps = [(high - low) / n for low, high, n in zip(lower, upper, reversed(shape), strict=True)]
-    firsts = [low + 0.5 * step for low, step in zip(lower, steps, strict=True)]
-    # Filled on the device: a copy from the host would make a GPU wait.
-    scale, shift = (
-        torch.stack([torch.full((), item, dtype=torch.float64, device=device) for item in items])
-        for items in (steps, firsts)
-    )
-    return homogeneous_row(torch.cat((torch.diag(scale), shift[:, None]), -1))
-
-
-def indices(count: int, device: torch.device) -> Tensor:
-    """0 to count - 1 in float64. Not to be written to: short ones on a CPU are made once."""
-    arange = _kept_arange if count <= 4096 and can_keep_constants(device) else torch.arange
-    return arange(count, dtype=torch.float64, device=device)
-
-
-_kept_box, _kept_arange = lru_cache(64)(_box), lru_cache(64)(torch.arange)
 
 
 def _bounds(name: str, value: object) -> tuple[float, float, float]:
@@ -224,8 +210,6 @@ def check_depths(who: str, depths: Tensor, axes: Sequence[int], view_mask: Tenso
     if depths.dim() not in axes or planes_of(depths) < 1:
         raise ShapeError(f"{who}: depths must be {expected} with P at least 1; got {tuple(depths.shape)}")
     if depths.dim() > 3 or not can_inspect(depths):
-        return
-    if depths.dim() == 1 and len(depths) <= 256 and all(a < b for a, b in pairwise((0.0, *depths.tolist(), torch.inf))):
         return
     with torch.no_grad():
         good = (depths > 0).all(-1) & depths.isfinite().all(-1) & (depths.diff(dim=-1) > 0).all(-1)
@@ -358,12 +342,12 @@ class FrustumGrid:
         P = matrices.projection()
         return torch.cat((P[..., :2, :], basis_row(P, 4, 3), P[..., 2:, :]), -2)
 
-    def lattice(self, device: torch.device | None = None, world_from_lattice: Tensor | None = None) -> Lattice:
-        """The lattice that the operators take, on a device or on the grid's own; its T may be given."""
-        T = self.world_from_lattice if world_from_lattice is None else world_from_lattice
+    def lattice(self, device: torch.device | None = None) -> Lattice:
+        """The lattice that the operators take, on a device or on the grid's own."""
+        T = self.world_from_lattice
         T = T if device is None else moved("FrustumGrid", "camera", T, device)
         _, height, width = self.shape
-        x, y = (indices(n, T.device) for n in (width, height))
+        x, y = (torch.arange(n, dtype=T.dtype, device=T.device) for n in (width, height))
         depths = moved("FrustumGrid", "depths", self.depths, T.device)
         return Lattice(T, x, y, depths[:, None] if depths.dim() == 4 else 1.0 / depths.double(), True)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import prod
 
 import torch
@@ -14,16 +13,12 @@ from lsmgeo.cameras.tensors import CameraTensors, image_sizes, leading_shape
 from lsmgeo.debugging import can_inspect
 from lsmgeo.errors import CameraError, ShapeError
 
-__all__ = ["check_cameras", "check_views", "image_size", "place_views", "rotation_error", "views_of", "views_per_scene"]
+__all__ = ["check_cameras", "check_views", "image_size", "rotation_error", "views_of", "views_per_scene"]
 
 
 def rotation_error(R: Tensor) -> Tensor:
     """``max |R^T R - I|`` of (..., 3, 3), (...)."""
     return (multiply(R.transpose(-1, -2), R) - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-1, -2))
-
-
-# Functions that check cameras in one call where they can, and say whether all are valid; `lsmgeo._sites` adds one.
-QUICK_CHECKS: list[Callable[[CameraTensors, Tensor | None], bool]] = []
 
 
 def check_cameras(who: str, cameras: CameraTensors, view_mask: Tensor | None = None) -> None:
@@ -42,8 +37,6 @@ def check_cameras(who: str, cameras: CameraTensors, view_mask: Tensor | None = N
     if not can_inspect(intrinsics) or intrinsics.numel() == 0:
         return
     with torch.no_grad():
-        if any(check(cameras, view_mask) for check in QUICK_CHECKS):
-            return
         K, E = intrinsics.double(), cam_from_world.double()
         R = E[..., :3, :3]
         residual = rotation_error(R)
@@ -86,7 +79,7 @@ def image_size(who: str, cameras: CameraTensors, size: tuple[int, int] | None = 
         return height, width
     if torch.compiler.is_compiling():
         raise CameraError(f"{who}: size must be given under torch.compile and torch.export; got None")
-    heights, widths = (sorted(set(side.flatten().tolist())) for side in image_sizes(cameras))
+    heights, widths = (side.unique().tolist() for side in image_sizes(cameras))
     if len(heights) != 1 or len(widths) != 1:
         raise CameraError(
             f"{who}: size must be given where views differ in size; got heights {heights}, widths {widths}"
@@ -131,21 +124,13 @@ def views_of(who: str, cameras: CameraTensors, views: tuple[int, int]) -> Camera
     return CameraTensors(*matrices, height, width)
 
 
-def place_views(
+def check_views(
     who: str, cameras: CameraTensors, views: tuple[int, int], view_mask: Tensor | None = None, **tensors: Tensor
 ) -> CameraTensors:
-    """Cameras with leading shape (B, V), see `views_of`, on the device of the mask and other tensors."""
+    """Cameras with leading shape (B, V), see `views_of`, checked and on the device of the mask and other tensors."""
     cameras = views_of(who, cameras, views)
     if view_mask is not None:
         check_mask(who, "view_mask", view_mask, views, "(B, V)")
     check_devices(who, **tensors, cameras=cameras.intrinsics, view_mask=view_mask)
-    return cameras
-
-
-def check_views(
-    who: str, cameras: CameraTensors, views: tuple[int, int], view_mask: Tensor | None = None, **tensors: Tensor
-) -> CameraTensors:
-    """The cameras of `place_views`, checked."""
-    cameras = place_views(who, cameras, views, view_mask, **tensors)
     check_cameras(who, cameras, view_mask)
     return cameras

@@ -20,7 +20,6 @@ from torch import Tensor
 from lsmgeo._dtypes import saturating_cast
 from lsmgeo._torch_compat import has_forward_derivatives, has_function_transforms, is_exporting, is_jit_traced
 from lsmgeo.kernels import reference
-from lsmgeo.kernels.direct_calls import direct, is_direct, save, saved
 from lsmgeo.kernels.lattice_geometry import pixels_in_front, project_points
 from lsmgeo.kernels.native import library
 from lsmgeo.kernels.project_reduce import project_reduce, project_reduce_backward
@@ -99,6 +98,18 @@ def _empty_at_sites(
 # Autograd
 
 
+def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+    """Save the arguments; backward recomputes the rest, so that nothing of the output's size is kept."""
+    ctx.save_for_backward(*(value if isinstance(value, Tensor) else None for value in inputs))
+    ctx.others = [None if isinstance(value, Tensor) else value for value in inputs]
+
+
+def _saved(ctx: Any) -> list[Any]:
+    """The arguments, in the order of the schema."""
+    pairs = zip(ctx.saved_tensors, ctx.others, strict=True)
+    return [other if tensor is None else tensor for tensor, other in pairs]
+
+
 def _gradients(
     gradient: Tensor | None,
     inputs: Sequence[Tensor | None],
@@ -125,13 +136,6 @@ def _gradients(
         found = iter(torch.autograd.grad(values, wanted, gradient, create_graph=True, allow_unused=True))
         return [next(found) if need else None for need in needs]
     return [part if need else None for part, need in zip(backward(list(needs)), needs, strict=True)]
-
-
-def _backward(name: str, *arguments: Any) -> Any:
-    """The fused kernels' backward."""
-    if is_direct(*arguments):
-        return _OPERATORS[name].backward(*arguments)
-    return getattr(torch.ops.lsmgeo, f"{name}_backward")(*arguments)
 
 
 def _shared(gradient: Tensor | None, z: Tensor) -> Tensor | None:
@@ -177,14 +181,14 @@ class _PlaneSweepProject:
         return _tensors(gradient, (to_source, matrix.new_empty(matrix.shape), to_direction, to_z), needs)
 
     def autograd(self, ctx: Any, gradient: Tensor | None, _: Any) -> tuple[Tensor | None, ...]:
-        volume, *flat = saved(ctx)
+        volume, *flat = _saved(ctx)
         sites = _sites(flat)
         of_volume, of_matrix, of_direction, _, _, of_z, *_ = ctx.needs_input_grad
         to_volume, to_matrix, to_direction, to_z = _gradients(
             gradient,
             (volume, sites.matrix, sites.direction, sites.z),
             (of_volume, of_matrix, of_direction, of_z),
-            lambda needs: _backward("plane_sweep_project", gradient, volume, *flat, needs),
+            lambda needs: torch.ops.lsmgeo.plane_sweep_project_backward(gradient, volume, *flat, needs),
             lambda: reference.plane_sweep_project(volume, sites, _options(flat)),
         )
         return to_volume, to_matrix, to_direction, None, None, _shared(to_z, sites.z), None, None, *_NO_OPTIONS
@@ -217,14 +221,14 @@ class _Unproject(_PlaneSweepProject):
         return _tensors(gradient, (*to_others, to_reference), flat[-1])
 
     def autograd(self, ctx: Any, gradient: Tensor | None, _: Any) -> tuple[Tensor | None, ...]:
-        features, other, *flat = saved(ctx)
+        features, other, *flat = _saved(ctx)
         sites = _sites(flat)
         of_features, of_reference, of_matrix, of_direction, _, _, of_z, *_ = ctx.needs_input_grad
         to_features, to_matrix, to_direction, to_z, to_reference = _gradients(
             gradient,
             (features, sites.matrix, sites.direction, sites.z, other),
             (of_features, of_matrix, of_direction, of_z, of_reference),
-            lambda needs: _backward("unproject", gradient, features, other, *flat, needs),
+            lambda needs: torch.ops.lsmgeo.unproject_backward(gradient, features, other, *flat, needs),
             lambda: reference.unproject(features, sites, other, _options(flat)),
         )
         to_sites = to_matrix, to_direction, None, None, _shared(to_z, sites.z), None, None
@@ -267,13 +271,13 @@ class _SampleViews:
         return _tensors(gradient, (to_features, pixels.new_empty(pixels.shape), to_extra), flat[-1])
 
     def autograd(self, ctx: Any, gradient: Tensor | None, _: Any) -> tuple[Tensor | None, ...]:
-        features, pixels, front, extra, *flat = arguments = saved(ctx)
+        features, pixels, front, extra, *flat = arguments = _saved(ctx)
         of_features, of_pixels, _, of_extra, *_ = ctx.needs_input_grad
         to_features, to_pixels, to_extra = _gradients(
             gradient,
             (features, pixels, extra),
             (of_features, of_pixels, of_extra),
-            lambda needs: _backward("sample_views", gradient, *arguments, needs),
+            lambda needs: torch.ops.lsmgeo.sample_views_backward(gradient, *arguments, needs),
             lambda: reference.sample_pixels(features, pixels, front, extra, _options(flat)),
         )
         return to_features, to_pixels, None, to_extra, *_NO_OPTIONS
@@ -311,14 +315,14 @@ class _ProjectReduce(_PlaneSweepProject):
         return _tensors(gradient, (to_volume, *of_weights, *of_sites), flat[-1])
 
     def autograd(self, ctx: Any, gradient: Tensor | None, _: Any) -> tuple[Tensor | None, ...]:
-        volume, weight, bias, *flat = arguments = saved(ctx)
+        volume, weight, bias, *flat = arguments = _saved(ctx)
         sites = _sites(flat)
         of_volume, of_weight, of_bias, of_matrix, of_direction, _, _, of_z, *_ = ctx.needs_input_grad
         *to_tensors, to_matrix, to_direction, to_z = _gradients(
             gradient,
             (volume, weight, bias, sites.matrix, sites.direction, sites.z),
             (of_volume, of_weight, of_bias, of_matrix, of_direction, of_z),
-            lambda needs: _backward("project_reduce", gradient, *arguments, needs),
+            lambda needs: torch.ops.lsmgeo.project_reduce_backward(gradient, *arguments, needs),
             lambda: reference.project_reduce(volume, sites, weight, bias, _options(flat)),
         )
         return *to_tensors, to_matrix, to_direction, None, None, _shared(to_z, sites.z), None, None, *_NO_OPTIONS
@@ -361,26 +365,21 @@ class _Splat(_PlaneSweepProject):
         return _tensors(gradient, (_channels_last(features, features.shape, 2), to_weights, to_matrix, to_z), flat[-1])
 
     def autograd(self, ctx: Any, gradient: Tensor | None, *_: Any) -> tuple[Tensor | None, ...]:
-        features, weights, shape, *flat = arguments = saved(ctx)
+        features, weights, shape, *flat = arguments = _saved(ctx)
         sites = _sites(flat)
         of_features, of_weights, _, of_matrix, _, _, _, of_z, *_ = ctx.needs_input_grad
         to_features, to_weights, to_matrix, to_z = _gradients(
             gradient,
             (features, weights, sites.matrix, sites.z),
             (of_features, of_weights, of_matrix, of_z),
-            lambda needs: _backward("splat", gradient, *arguments, needs),
+            lambda needs: torch.ops.lsmgeo.splat_backward(gradient, *arguments, needs),
             lambda: (reference.splat(features, sites, weights, shape, _options(flat)),),
         )
         to_sites = to_matrix, None, None, None, _shared(to_z, sites.z), None, None
         return to_features, to_weights, None, *to_sites, *_NO_OPTIONS
 
 
-_OPERATORS = {
-    made.name: made for made in (_Unproject(), _SampleViews(), _PlaneSweepProject(), _ProjectReduce(), _Splat())
-}
-_DIRECT = {name: direct(operator) for name, operator in _OPERATORS.items()}
-
-for _operator in _OPERATORS.values():
+for _operator in (_Unproject(), _SampleViews(), _PlaneSweepProject(), _ProjectReduce(), _Splat()):
     _name, _answers = _operator.name, ", ".join(["Tensor"] * _operator.derivatives)
     _library.define(f"{_name}({_operator.schema}) -> {getattr(_operator, 'answers', '(Tensor, Tensor)')}")
     _needs = f"bool[{_operator.derivatives}] needs"
@@ -393,32 +392,28 @@ for _operator in _OPERATORS.values():
         torch.library.register_fake(f"lsmgeo::{_full_name}", _fake, lib=_library)
         for _device in ("CPU", "CUDA"):  # arithmetic is in float32 under autocast too
             _library.impl(_full_name, torch.library.fallthrough_kernel, f"Autocast{_device}")
-    torch.library.register_autograd(f"lsmgeo::{_name}", _operator.autograd, setup_context=save, lib=_library)
+    torch.library.register_autograd(f"lsmgeo::{_name}", _operator.autograd, setup_context=_save, lib=_library)
 
 
 # The operators of a backend, as `lsmgeo.kernels` calls them
 
 
-def _call(name: str, *inputs: Any) -> Any:
-    return _DIRECT[name](*inputs) if is_direct(*inputs) else getattr(torch.ops.lsmgeo, name)(*inputs)
-
-
-def _at_sites(name: str, backend: str, source: Tensor, sites: Sites, *rest: Any) -> Any:
+def _at_sites(operator: Callable[..., Any], backend: str, source: Tensor, sites: Sites, *rest: Any) -> Any:
     *tensors, options = rest
-    return _call(name, source, *tensors, *sites, *options.on(backend))
+    return operator(source, *tensors, *sites, *options.on(backend))
 
 
 def _at_pixels(project: Callable[..., Any], backend: str, features: Tensor, *arguments: Any) -> Any:
-    return _call("sample_views", features, *project(*arguments), *arguments[-1].on(backend))
+    return torch.ops.lsmgeo.sample_views(features, *project(*arguments), *arguments[-1].on(backend))
 
 
 def operators(backend: str) -> dict[str, Callable[..., Any]]:
     """The operators run by the kernels of this name."""
     return {
-        "unproject": partial(_at_sites, "unproject", backend),
+        "unproject": partial(_at_sites, torch.ops.lsmgeo.unproject, backend),
         "unproject_points": partial(_at_pixels, project_points, backend),
         "sample_views": partial(_at_pixels, pixels_in_front, backend),
-        "plane_sweep_project": partial(_at_sites, "plane_sweep_project", backend),
-        "project_reduce": partial(_at_sites, "project_reduce", backend),
-        "splat": partial(_at_sites, "splat", backend),
+        "plane_sweep_project": partial(_at_sites, torch.ops.lsmgeo.plane_sweep_project, backend),
+        "project_reduce": partial(_at_sites, torch.ops.lsmgeo.project_reduce, backend),
+        "splat": partial(_at_sites, torch.ops.lsmgeo.splat, backend),
     }

@@ -95,7 +95,6 @@ def test_a_model_that_differs_on_hand_written_operators_is_not_timed(name):
         ("systems", ["Frustum, variance, forward", "kornia DepthWarper", "running mean (Atlas)"]),
         ("cost_volumes", ["4 warped volumes, forward", "repeat and warp : correlation", "through points"]),
         ("splats", ["nearest, 6 views onto 200 x 1 x 200, forward", "outer product, index_add : splat"]),
-        ("small_calls", ["Unproject, 1 x 1 x 1 x 8^3, forward", "lsmgeo : hand-written"]),
         ("gpu", ["Sweep, 128^3, nearest, forward+backward", "share of the copy's bandwidth"]),
         ("scenes", ["10 solids, 64 x 64, 1 x 20 views, shadows"]),
         ("render_set", ["lsmgeo render, 4 shapes of 2 views at 64 x 64 with depth and voxels"]),

@@ -137,8 +137,6 @@ void run_on_threads(int64_t threads, Body &body) {
     for (auto &other : others) other.join();
 }
 
-#include "geometry.h"
-
 double power_of_two_above(double value) { return std::exp2(std::ceil(std::log2(value))); }
 
 double max_abs(const double *values, int64_t count, int64_t stride = 1) {
@@ -299,10 +297,6 @@ int run(const Call &call, bool backward) {
 EXPORT int lsmgeo_forward(const Call *call) { return run(*call, false); }
 
 EXPORT int lsmgeo_backward(const Call *call) { return run(*call, true); }
-
-EXPORT int64_t lsmgeo_compose(const Geometry *call) { return compose(*call); }
-
-EXPORT int64_t lsmgeo_size_of_geometry() { return int64_t(sizeof(Geometry)); }
 
 EXPORT int64_t lsmgeo_size_of_call() { return int64_t(sizeof(Call)); }
 

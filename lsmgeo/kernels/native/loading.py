@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sysconfig
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -99,17 +99,6 @@ def load(path: Path) -> ctypes.CDLL | str:
     except (AttributeError, OSError, TypeError):
         pass  # the library starts threads of its own
     return library
-
-
-@cache
-def composer(size: int) -> Callable[[bytes], int] | None:
-    """The function of native/geometry.h, for arguments of `size` bytes; None without a library that has it."""
-    library = _library()
-    if isinstance(library, str) or not hasattr(library, "lsmgeo_compose"):
-        return None
-    library.lsmgeo_compose.argtypes, library.lsmgeo_compose.restype = (ctypes.c_char_p,), ctypes.c_int64
-    library.lsmgeo_size_of_geometry.restype = ctypes.c_int64
-    return library.lsmgeo_compose if library.lsmgeo_size_of_geometry() == size else None
 
 
 @as_constant

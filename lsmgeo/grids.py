@@ -213,8 +213,8 @@ def check_depths(who: str, depths: Tensor, axes: Sequence[int], view_mask: Tenso
         return
     with torch.no_grad():
         good = (depths > 0).all(-1) & depths.isfinite().all(-1) & (depths.diff(dim=-1) > 0).all(-1)
-        if view_mask is not None and depths.dim() > 1:
-            good = good | ~(view_mask if depths.dim() == 3 else view_mask.any(1))
+        if view_mask is not None and depths.dim() == 3:
+            good = good | ~view_mask
         if not bool(good.all()):
             row = depths[tuple((~good).nonzero()[0].tolist())]
             raise GridError(

@@ -144,7 +144,7 @@ def test_bevformer_attention():
 
 
 def test_simple_bev():
-    expected = mean_of_visible(*sampled(SITES)).reshape(B, C * GRID.shape[0], *GRID.shape[1:])
+    expected = mean_of_visible(*sampled(SITES, padding_mode="border")).reshape(B, C * GRID.shape[0], *GRID.shape[1:])
     found = recipes.simple_bev(FEATURES, CAMERAS, GRID)
     assert found.shape == expected.shape
     close(found, expected)
@@ -185,7 +185,7 @@ def test_atlas_update(parts):
 
 def test_neuralrecon_points():
     points = 1.3 * random(B, 40, 3) - 0.65
-    values, visible = sampled(points.numpy(), augment=("depth",))
+    values, visible = sampled(points.numpy(), padding_mode="border", augment=("depth",))
     mean = mean_of_visible(values, visible)
     for b in range(B):
         seen = visible[b].any(0)

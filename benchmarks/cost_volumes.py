@@ -102,12 +102,14 @@ WORK: tuple[tuple[Any, ...], ...] = (
 )  # fmt: skip
 
 
-def _forward(run: Callable[..., Tensor], inputs: Inputs) -> Tensor:
+def forward(run: Callable[..., Tensor], inputs: tuple[Tensor, ...]) -> Tensor:
+    """The answer, without a graph."""
     with torch.no_grad():
         return run(*inputs)
 
 
-def _both(run: Callable[..., Tensor], inputs: Inputs, cotangent: Tensor) -> tuple[Tensor, ...]:
+def both(run: Callable[..., Tensor], inputs: tuple[Tensor, ...], cotangent: Tensor) -> tuple[Tensor, ...]:
+    """Forward and backward: the gradients to the inputs that need one."""
     wanted = [leaf for leaf in inputs if leaf.requires_grad]
     return torch.autograd.grad(run(*inputs), wanted, cotangent, allow_unused=True)
 
@@ -122,12 +124,12 @@ def _memory(sizes: tuple[int, int, int], size: tuple[int, int], quick: bool, wor
     """Bytes of a forward and backward, see `comparing.memory`."""
     views = Views(*sizes, quick, size)
     run, inputs = partial(getattr(views, work), name), _leaves(views.inputs, work)
-    output = _forward(run, inputs)
+    output = forward(run, inputs)
     cotangent = torch.ones_like(output)
     kept = {"output": output.nbytes, "visible": output.numel() // output.shape[1] * sizes[0]}
     kept["gradients"] = sum(leaf.nbytes for leaf in inputs if leaf.requires_grad)
     del output
-    peak = measuring.peak(partial(_both, run, inputs, cotangent))
+    peak = measuring.peak(partial(both, run, inputs, cotangent))
     held = sum(leaf.nbytes for leaf in inputs)
     return {**kept, "inputs": held, "peak": peak, "above": peak - sum(kept.values())}
 
@@ -141,7 +143,7 @@ def measure(settings: Settings) -> list[dict[str, Any]]:
         views = Views(*sizes, settings.quick, size)
         inputs = _leaves(views.inputs, work)
         runs = {name: partial(getattr(views, work), name) for name in names}
-        outputs = {name: _forward(run, inputs) for name, run in runs.items()}
+        outputs = {name: forward(run, inputs) for name, run in runs.items()}
         same = [name for name in names if name not in (PLANES, VARIANCE)]  # these compute something else
         for name in same[1:]:
             compare(f"{label}, {name}", outputs[name], outputs[same[0]], BORDERS)
@@ -149,9 +151,7 @@ def measure(settings: Settings) -> list[dict[str, Any]]:
         del outputs
         for kind in KINDS:
             calls = {
-                name: partial(_forward, run, inputs)
-                if kind == FORWARD
-                else partial(_both, run, inputs, cotangents[name])
+                name: partial(forward, run, inputs) if kind == FORWARD else partial(both, run, inputs, cotangents[name])
                 for name, run in runs.items()
             }
             taken = measuring.interleaved(calls, settings.repeats, budget=20.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from itertools import product
 from typing import Any
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from benchmarks import measuring, report
 from benchmarks.comparing import FORWARD, KINDS, compare
+from benchmarks.cost_volumes import both, forward
 from benchmarks.measuring import Settings
 from benchmarks.problems import channels_last
 from lsmgeo import CameraTensors, FrustumGrid, VoxelGrid, cameras, depth_planes, functional
@@ -83,15 +83,6 @@ class Rig:
         return volume.view(1, D, H, W, channels).movedim(-1, 1)
 
 
-def _forward(run: Callable[..., Tensor], inputs: tuple[Tensor, ...]) -> Tensor:
-    with torch.no_grad():
-        return run(*inputs)
-
-
-def _both(run: Callable[..., Tensor], inputs: tuple[Tensor, ...], cotangent: Tensor) -> tuple[Tensor, ...]:
-    return torch.autograd.grad(run(*inputs), inputs, cotangent)
-
-
 def _inputs(rig: Rig, name: str) -> tuple[Tensor, ...]:
     features, weights = (leaf.clone() for leaf in rig.inputs)
     features = features if name == CONTIGUOUS else channels_last(features, 2)
@@ -102,11 +93,11 @@ def _memory(label: str, quick: bool, name: str) -> dict[str, Any]:
     """Bytes of a forward and backward."""
     rig = Rig(label, quick)
     run, inputs = partial(rig.run, name), _inputs(rig, name)
-    output = _forward(run, inputs)
+    output = forward(run, inputs)
     cotangent, held = torch.ones_like(output), sum(leaf.nbytes for leaf in inputs)
     kept = {"output": output.nbytes, "visible": 0, "gradients": held}
     del output
-    peak = measuring.peak(partial(_both, run, inputs, cotangent))
+    peak = measuring.peak(partial(both, run, inputs, cotangent))
     return {**kept, "inputs": held, "peak": peak, "above": peak - sum(kept.values())}
 
 
@@ -120,15 +111,15 @@ def measure(settings: Settings) -> list[dict[str, Any]]:
         runs, inputs = (
             {name: make(name) for name in names} for make in (partial(partial, rig.run), partial(_inputs, rig))
         )
-        outputs = {name: _forward(runs[name], inputs[name]) for name in names}
+        outputs = {name: forward(runs[name], inputs[name]) for name in names}
         for name in (CONTIGUOUS, HAND):
             compare(f"{label}, {name}", outputs[name], outputs[SPLAT], LIMITS[rig.mode])
         cotangent = torch.ones_like(outputs[SPLAT])
         for kind in KINDS:
             calls = {
-                name: partial(_forward, runs[name], inputs[name])
+                name: partial(forward, runs[name], inputs[name])
                 if kind == FORWARD
-                else partial(_both, runs[name], inputs[name], cotangent)
+                else partial(both, runs[name], inputs[name], cotangent)
                 for name in names
             }
             taken = measuring.interleaved(calls, settings.repeats, budget=20.0)

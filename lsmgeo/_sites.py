@@ -112,9 +112,9 @@ def image_sites(
     _check_reference(who, reference, features, grid, options)
     T, x, y, z, projective = lattice
     T = T if T.dim() == 2 else T[:, None]  # (B, 1, 4, 4): shared by the views
-    if view_mask is not None and z.dim() == 5:  # depths of pixels that only masked views would read are not read
-        z = torch.where(view_mask.any(1)[:, None, None, None, None], z, 1.0)
-    if z.dim() == 5:
+    if z.dim() == 5:  # depths of pixels
+        if view_mask is not None:  # those that only masked views would read are not read
+            z = torch.where(view_mask.any(1)[:, None, None, None, None], z, 1.0)
         check_pixel_depths(who, z[:, 0])
     direction = direction_matrix(matrices, T, options.direction) if options.direction else None
     return Sites(multiply(matrices.projection(), T), direction, x, y, z, projective, view_mask)

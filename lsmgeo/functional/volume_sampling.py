@@ -214,7 +214,7 @@ def sample_volume(
     Equation: ``f(X) = G(i)`` with G the volume interpolated and i the index of X: on a `VoxelGrid` ``i = A^-1 X``, A
     its world from index; on a `FrustumGrid` the pixel ``(x / z, y / z)`` and the plane of depth z, ``(x, y, z) =
     K (R X + t)``. Between planes k and k + 1 at depths a and b, the plane is ``k + (1/a - 1/z) / (1/a - 1/b)``, linear
-    in 1/z as a homography's pixels are; before the first plane and behind the last, the end intervals go on.
+    in 1/z as a homography's pixels are; before the first plane and behind the last, the end intervals are extrapolated.
 
     Convention:
         Voxel centres, pixel centres and planes at integers. A point is visible where its index lies in

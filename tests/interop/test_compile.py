@@ -48,6 +48,13 @@ def test_one_graph_of_any_number_of_scenes_and_views():
     assert len(graphs) == 1
 
 
+def assert_same_gradients(compiled, energy, leaves):
+    actual, expected = (torch.autograd.grad(run(*leaves), leaves) for run in (compiled, energy))
+    for mine, other in zip(actual, expected, strict=True):
+        assert other.abs().max() > 0
+        torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-4)
+
+
 def test_gradients_of_a_graph():
     def energy(features, K, E):
         volume, _ = functional.unproject(features, CameraTensors(K, E, 24, 32), GRID, reduce=("mean", "max"))
@@ -55,10 +62,7 @@ def test_gradients_of_a_graph():
 
     leaves = [tensor.requires_grad_() for tensor in arguments(2, 3)[:3]]
     compiled = torch.compile(energy, fullgraph=True, backend="aot_eager")
-    actual, expected = (torch.autograd.grad(run(*leaves), leaves) for run in (compiled, energy))
-    for mine, other in zip(actual, expected, strict=True):
-        assert other.abs().max() > 0
-        torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-4)
+    assert_same_gradients(compiled, energy, leaves)
 
 
 def matching_costs(features, K, E, depths, reference):
@@ -85,10 +89,7 @@ def test_depths_of_pixels_and_correlation_compile():
 
     leaves = [tensor.requires_grad_() for tensor in matching_inputs()]
     compiled = torch.compile(energy, fullgraph=True, backend="aot_eager")
-    actual, expected = (torch.autograd.grad(run(*leaves), leaves) for run in (compiled, energy))
-    for mine, other in zip(actual, expected, strict=True):
-        assert other.abs().max() > 0
-        torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-4)
+    assert_same_gradients(compiled, energy, leaves)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
@@ -113,10 +114,7 @@ def test_volumes_at_points_compile():
     compiled = torch.compile(energy, fullgraph=True, backend="aot_eager", dynamic=True)
     for scenes in (2, 3):
         leaves = [tensor.requires_grad_() for tensor in points_arguments(scenes)]
-        actual, expected = (torch.autograd.grad(run(*leaves), leaves) for run in (compiled, energy))
-        for mine, other in zip(actual, expected, strict=True):
-            assert other.abs().max() > 0
-            torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-4)
+        assert_same_gradients(compiled, energy, leaves)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
